@@ -1,0 +1,1 @@
+"""Pure, batched, masked geometry on tensors: frames, boxes and road edges."""

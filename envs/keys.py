@@ -1,0 +1,75 @@
+"""Every tensordict key of the project, and the alphabet of shapes.
+
+Shapes are written with one alphabet everywhere:
+
+====== ==================================================================
+``S``  scenes
+``K``  rollouts of each scene; the K rollouts of a scene are contiguous
+``B``  ``S * K`` rows of the vectorised environment
+``A``  agents, padded to the largest scene of a batch, with a ``valid`` mask
+``T``  decisions of 0.5 s (16 in an episode)
+``F``  poses of 0.1 s inside one decision (5)
+``L``  logged steps of 0.1 s (91: ten of history, the current one, eighty to come)
+``V``  motion tokens
+``P``  polylines of a map
+``N``  points of a map
+``G``  lanes with a traffic light
+====== ==================================================================
+
+Units are metres, seconds and radians. A *pose* is ``(x, y, heading)``; x points forward, y left and angles are
+counter-clockwise. Positions are relative to the origin of their scene.
+"""
+
+from __future__ import annotations
+
+from tensordict import NestedKey
+
+# --- what the environment shows -------------------------------------------------------------------------------------
+SCENE: NestedKey = "scene"
+"""``[B]`` int64: the index of the row's scene in its :class:`~envs.scene.SceneSource`."""
+STEP: NestedKey = "step"
+"""``[B, 1]`` int64: decisions taken so far in the episode."""
+AGENTS = "agents"
+RECENT: NestedKey = (AGENTS, "recent")
+"""``[B, A, F + 1, 3]``: poses of the last 0.5 s, the current one last."""
+VALID: NestedKey = (AGENTS, "valid")
+"""``[B, A]`` bool: the agent exists now."""
+CONTROLLED: NestedKey = (AGENTS, "controlled")
+"""``[B, A]`` bool: the policy moves the agent (otherwise it follows its log)."""
+
+# --- what a policy writes -------------------------------------------------------------------------------------------
+ACTION: NestedKey = (AGENTS, "action")
+"""``[B, A, F, 3]``: the next F poses, in the agent's own current frame."""
+TOKEN: NestedKey = (AGENTS, "token")
+"""``[B, A]`` int64: the motion token that an action came from."""
+LOG_PROB: NestedKey = (AGENTS, "log_prob")
+"""``[B, A]``: log-probability of the token under the whole model (temperature 1, nothing cut) [nats]."""
+
+# --- what a step gives back -----------------------------------------------------------------------------------------
+REWARD: NestedKey = (AGENTS, "reward")
+"""``[B, A, 1]``: minus the mean displacement from the log over the decision's poses [m]."""
+DONE: NestedKey = "done"
+TERMINATED: NestedKey = "terminated"
+TRUNCATED: NestedKey = "truncated"
+
+# --- what ranking attaches to a group of K rollouts of one scene (batch size [S]) -----------------------------------
+TOKENS: NestedKey = "tokens"
+"""``[S, K, A, T]`` int64 (uint8 or int16 on disk): tokens of every rollout."""
+TOKEN_VALID: NestedKey = "token_valid"
+"""``[S, A, T]`` bool: controlled agents whose tokens count."""
+DISTANCE: NestedKey = "distance"
+"""``[S, K]``: preference distance of a rollout to the log, agents aggregated."""
+AGENT_DISTANCE: NestedKey = "agent_distance"
+"""``[S, K, A]``: the same for each agent (0 where the agent took no part)."""
+ADE: NestedKey = "ade"
+"""``[S, K]``: mean displacement from the log [m]."""
+AGENT_RANKED: NestedKey = "agent_ranked"
+"""``[S, A]`` bool: agents that took part in the ranking."""
+RANK: NestedKey = "rank"
+"""``[S, K]`` int64: 0 is the nearest rollout."""
+
+# --- what a loss reads ----------------------------------------------------------------------------------------------
+PREFERRED: NestedKey = "preferred"
+"""``[S, M, A, T]`` int64: tokens of the preferred rollouts of a batch of pairs."""
+UNPREFERRED: NestedKey = "unpreferred"
+"""``[S, M, A, T]`` int64: tokens of the unpreferred rollouts, pair by pair."""

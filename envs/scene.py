@@ -1,0 +1,301 @@
+"""A traffic scene: tracks, map and lights of 9.1 s, as one TensorClass.
+
+A :class:`Scene` is ragged: it holds exactly the agents, points, polylines and lights that its recording has.
+:func:`collate` pads several scenes to one batch. Sources make scenes (:mod:`envs.sources`), the store keeps them
+(:mod:`envs.store`), and everything else reads them through the :class:`SceneSource` protocol, so a list of scenes
+and a store of a million are the same thing to the environment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import Protocol, runtime_checkable
+
+import torch
+from tensordict import TensorClass
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+STEP_SECONDS = 0.1
+"""Time between two logged steps [s] (WOMD: 10 Hz)."""
+LOG_STEPS = 91
+"""L: logged steps in a scene."""
+CURRENT_STEP = 10
+"""Index of the current step: ten steps of history lie before it, eighty follow."""
+
+
+class SceneError(ValueError):
+    """A scene, or the file that it came from, is not usable; the message names it and says the fix."""
+
+
+class AgentKind(IntEnum):
+    """Class of a road user (numbers of the WOMD ``Track.ObjectType``)."""
+
+    UNSET = 0
+    VEHICLE = 1
+    PEDESTRIAN = 2
+    CYCLIST = 3
+    OTHER = 4
+
+
+class MapKind(IntEnum):
+    """Type of a map polyline (numbers of the WOMD ``roadgraph_samples/type``)."""
+
+    LANE_UNDEFINED = 0
+    LANE_FREEWAY = 1
+    LANE_SURFACE_STREET = 2
+    LANE_BIKE = 3
+    LINE_UNKNOWN = 5
+    LINE_BROKEN_WHITE = 6
+    LINE_SOLID_WHITE = 7
+    LINE_DOUBLE_WHITE = 8
+    LINE_BROKEN_YELLOW = 9
+    LINE_BROKEN_DOUBLE_YELLOW = 10
+    LINE_SOLID_YELLOW = 11
+    LINE_SOLID_DOUBLE_YELLOW = 12
+    LINE_PASSING_YELLOW = 13
+    EDGE_UNKNOWN = 14
+    EDGE_BOUNDARY = 15
+    EDGE_MEDIAN = 16
+    STOP_SIGN = 17
+    CROSSWALK = 18
+    SPEED_BUMP = 19
+    DRIVEWAY = 20
+
+
+LANE_KINDS = (MapKind.LANE_UNDEFINED, MapKind.LANE_FREEWAY, MapKind.LANE_SURFACE_STREET, MapKind.LANE_BIKE)
+EDGE_KINDS = (MapKind.EDGE_UNKNOWN, MapKind.EDGE_BOUNDARY, MapKind.EDGE_MEDIAN)
+NUM_MAP_KINDS = max(MapKind) + 1
+
+
+class LinkKind(IntEnum):
+    """How one lane is tied to another."""
+
+    EXIT = 0
+    """The second lane follows the first one."""
+    LEFT = 1
+    """The second lane lies to the left of the first one, and a vehicle may change to it."""
+    RIGHT = 2
+    """The second lane lies to the right of the first one, and a vehicle may change to it."""
+
+
+class LightState(IntEnum):
+    """State of a lane's traffic light (numbers of the WOMD ``TrafficSignalLaneState.State``; -1 is ours)."""
+
+    ABSENT = -1
+    UNKNOWN = 0
+    ARROW_STOP = 1
+    ARROW_CAUTION = 2
+    ARROW_GO = 3
+    STOP = 4
+    CAUTION = 5
+    GO = 6
+    FLASHING_STOP = 7
+    FLASHING_CAUTION = 8
+
+
+class Agents(TensorClass["nocast"]):
+    """Tracks of the road users of a scene (``*`` is nothing, or ``S`` once collated).
+
+    Attributes:
+        position: ``[*, A, L, 3]`` float32, centre of the box, in the scene's frame [m]; 0 where invalid.
+        heading: ``[*, A, L]`` float32 [rad]; 0 where invalid.
+        velocity: ``[*, A, L, 2]`` float32 [m/s]; 0 where invalid.
+        valid: ``[*, A, L]`` bool.
+        extent: ``[*, A, 3]`` float32, length, width, height at the current step (the first valid step for agents
+            that are not there at the current step) [m].
+        kind: ``[*, A]`` int64, :class:`AgentKind`.
+        track_id: ``[*, A]`` int64, the recording's own id; -1 for padding.
+        predict: ``[*, A]`` bool, the recording asks for this agent's prediction (WOMD ``tracks_to_predict``).
+        sdc: ``[*, A]`` bool, the self-driving car: exactly one agent of a scene.
+    """
+
+    position: Tensor
+    heading: Tensor
+    velocity: Tensor
+    valid: Tensor
+    extent: Tensor
+    kind: Tensor
+    track_id: Tensor
+    predict: Tensor
+    sdc: Tensor
+
+    @property
+    def present(self) -> Tensor:
+        """``[*, A]`` bool: valid at the current step; the agents of a simulation (SPEC section 1.2)."""
+        return self.valid[..., CURRENT_STEP]
+
+    @property
+    def evaluated(self) -> Tensor:
+        """``[*, A]`` bool: the SDC and the tracks to predict (SPEC section 1.3)."""
+        return self.sdc | self.predict
+
+
+class RoadMap(TensorClass["nocast"]):
+    """Polylines of a map, all points in one flat row.
+
+    Polyline ``p`` owns the points ``start[p] : start[p] + count[p]``. Polygons (crosswalk, speed bump, driveway) are
+    not closed; a stop sign is a polyline of one point. Road edges have the drivable side on their left.
+
+    Attributes:
+        points: ``[*, N, 3]`` float32, in the scene's frame [m].
+        start: ``[*, P]`` int64, first point.
+        count: ``[*, P]`` int64, number of points; 0 for padding.
+        kind: ``[*, P]`` int64, :class:`MapKind`.
+        feature_id: ``[*, P]`` int64, the recording's own id; -1 for padding.
+        speed_limit: ``[*, P]`` float32 [m/s]; 0 where the source has none.
+        links: ``[*, E, 3]`` int64, rows ``(feature_id, feature_id, LinkKind)``; -1 for padding.
+    """
+
+    points: Tensor
+    start: Tensor
+    count: Tensor
+    kind: Tensor
+    feature_id: Tensor
+    speed_limit: Tensor
+    links: Tensor
+
+
+class Lights(TensorClass["nocast"]):
+    """Traffic lights, by the lane that they rule.
+
+    Attributes:
+        lane_id: ``[*, G]`` int64, ``feature_id`` of the lane; -1 for padding.
+        state: ``[*, G, L]`` int64, :class:`LightState`; ``ABSENT`` where the step does not list the lane.
+        stop_point: ``[*, G, L, 3]`` float32, where vehicles stop, in the scene's frame [m]; 0 where absent.
+    """
+
+    lane_id: Tensor
+    state: Tensor
+    stop_point: Tensor
+
+
+class Scene(TensorClass["nocast"]):
+    """One recorded (or generated) traffic scene of 9.1 s, or a padded batch of them.
+
+    Attributes:
+        agents: :class:`Agents`.
+        road: :class:`RoadMap`.
+        lights: :class:`Lights`.
+        origin: ``[*, 3]`` float64, what was subtracted from the source's coordinates [m].
+        scene_id: the recording's id (a list of them once collated).
+
+    Examples:
+        >>> from envs.sources.synthetic import straight_road
+        >>> scene = straight_road(num_vehicles=2)
+        >>> scene.agents.position.shape
+        torch.Size([2, 91, 3])
+        >>> collate([scene, straight_road(num_vehicles=3)]).agents.position.shape
+        torch.Size([2, 3, 91, 3])
+    """
+
+    agents: Agents
+    road: RoadMap
+    lights: Lights
+    origin: Tensor
+    scene_id: str
+
+    def validate(self, name: str | None = None) -> Scene:
+        """Check one uncollated scene and return it.
+
+        Args:
+            name: what to call the scene in an error (a file and record); its ``scene_id`` by default.
+
+        Raises:
+            SceneError: no SDC, no agent at the current step, no road edge, a value that is not finite, or fields whose
+                sizes disagree. The message names the scene and the fix.
+        """
+        name = f"{name} (scene {self.scene_id})" if name else f"scene {self.scene_id}"
+        agents, road = self.agents, self.road
+        num_agents = agents.position.shape[0]
+        if agents.position.shape != (num_agents, LOG_STEPS, 3) or agents.valid.shape != (num_agents, LOG_STEPS):
+            raise SceneError(
+                f"{name}: tracks must have {LOG_STEPS} steps of 0.1 s, got positions of shape "
+                f"{tuple(agents.position.shape)}. Cut or resample the recording."
+            )
+        if int(agents.sdc.sum()) != 1:
+            raise SceneError(f"{name}: {int(agents.sdc.sum())} agents are marked as SDC; mark exactly one.")
+        if not agents.present.any():
+            raise SceneError(f"{name}: no agent is valid at the current step {CURRENT_STEP}; leave the scene out.")
+        if not agents.present[agents.sdc].all():
+            raise SceneError(f"{name}: the SDC is not valid at the current step {CURRENT_STEP}; leave the scene out.")
+        for field in ("position", "heading", "velocity"):
+            values = getattr(agents, field)[agents.valid]
+            if not torch.isfinite(values).all():
+                bad = values[~torch.isfinite(values)][0].item()
+                agent = int((~torch.isfinite(getattr(agents, field)).flatten(1).all(1)).nonzero()[0])
+                raise SceneError(
+                    f"{name}: track {int(agents.track_id[agent])} has {field} {bad} at a valid step; mark it invalid."
+                )
+        if not (agents.extent[agents.present] > 0).all():
+            raise SceneError(f"{name}: an agent at the current step has an extent (length, width, height) that is not positive.")
+        if not torch.isfinite(road.points).all():
+            raise SceneError(f"{name}: a map point is not finite; remove the polyline.")
+        edges = torch.isin(road.kind, torch.tensor(EDGE_KINDS)) & (road.count >= 2)
+        if not edges.any():
+            raise SceneError(f"{name}: the map has no road edge of two points or more; off-road is undefined.")
+        return self
+
+
+@runtime_checkable
+class SceneSource(Protocol):
+    """Anything that gives scenes by index: a list, a :class:`~envs.store.SceneStore`, a subset of one."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int, /) -> Scene: ...
+
+
+def select_agents(scene: Scene, index: Tensor) -> Scene:
+    """Keep some agents of one uncollated scene, in the order given.
+
+    Args:
+        scene: a scene of A agents.
+        index: ``[A']`` int64 or ``[A]`` bool.
+    """
+    scene = scene.clone(recurse=False)
+    agents = scene.agents
+    scene.agents = Agents(
+        **{field: getattr(agents, field)[index] for field in agents.__dataclass_fields__}, batch_size=[]
+    )
+    return scene
+
+
+def collate(scenes: Sequence[Scene]) -> Scene:
+    """Pad scenes to one batch of batch size ``[S]``.
+
+    Padding agents and polylines are invalid in every mask: ``valid`` false, ``count`` 0, ids and kinds -1 where a field
+    documents it, 0 otherwise.
+
+    Args:
+        scenes: S uncollated scenes.
+    """
+    size = [len(scenes)]
+
+    def pad(part: str, cls: type, fill: dict[str, float]) -> TensorClass:
+        parts = [getattr(scene, part) for scene in scenes]
+        fields = cls.__dataclass_fields__
+        return cls(
+            **{
+                name: pad_sequence([getattr(p, name) for p in parts], batch_first=True, padding_value=fill.get(name, 0))
+                for name in fields
+            },
+            batch_size=size,
+        )
+
+    return Scene(
+        agents=pad("agents", Agents, {"track_id": -1}),
+        road=pad("road", RoadMap, {"feature_id": -1, "links": -1}),
+        lights=pad("lights", Lights, {"lane_id": -1, "state": LightState.ABSENT}),
+        origin=torch.stack([scene.origin for scene in scenes]),
+        scene_id=[scene.scene_id for scene in scenes],
+        batch_size=size,
+    )
+
+
+def polylines(scene: Scene, kinds: Sequence[int]) -> list[Tensor]:
+    """The polylines of some kinds of one uncollated scene, each ``[n, 3]``, in map order."""
+    road = scene.road
+    keep = torch.isin(road.kind, torch.as_tensor(tuple(kinds)))
+    return [road.points[s : s + n] for s, n in zip(road.start[keep].tolist(), road.count[keep].tolist(), strict=True)]

@@ -1,0 +1,1 @@
+"""Raw files to :class:`~envs.scene.Scene`: one module for each source."""

@@ -1,0 +1,1 @@
+"""The experiments: scripts that read top to bottom, one YAML for each named method."""
