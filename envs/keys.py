@@ -34,6 +34,8 @@ RECENT: NestedKey = (AGENTS, "recent")
 """``[B, A, F + 1, 3]``: poses of the last 0.5 s, the current one last."""
 VALID: NestedKey = (AGENTS, "valid")
 """``[B, A]`` bool: the agent exists now."""
+KIND: NestedKey = (AGENTS, "kind")
+"""``[B, A]`` int64: class of the agent, :class:`~envs.scene.AgentKind`."""
 CONTROLLED: NestedKey = (AGENTS, "controlled")
 """``[B, A]`` bool: the policy moves the agent (otherwise it follows its log)."""
 

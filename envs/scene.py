@@ -122,6 +122,30 @@ class Agents(TensorClass["nocast"]):
     sdc: Tensor
 
     @property
+    def poses(self) -> Tensor:
+        """``[*, A, L, 3]``: x, y, heading of every logged step; 0 where invalid."""
+        return torch.cat((self.position[..., :2], self.heading[..., None]), -1)
+
+    def recent(self, steps: int) -> Tensor:
+        """Poses of the last logged steps up to the current one, without holes.
+
+        Where the log is invalid, the pose is carried back from the next one at constant velocity and heading.
+
+        Args:
+            steps: F, length of a decision [0.1 s].
+
+        Returns:
+            ``[*, A, F + 1, 3]``, the current pose last.
+        """
+        window = slice(CURRENT_STEP - steps, CURRENT_STEP + 1)
+        poses, valid = self.poses[..., window, :].clone(), self.valid[..., window]
+        back = torch.cat((self.velocity[..., CURRENT_STEP, :] * STEP_SECONDS, torch.zeros_like(poses[..., 0, :1])), -1)
+        for step in reversed(range(steps)):
+            held = poses[..., step + 1, :] - back
+            poses[..., step, :] = torch.where(valid[..., step, None], poses[..., step, :], held)
+        return poses
+
+    @property
     def present(self) -> Tensor:
         """``[*, A]`` bool: valid at the current step; the agents of a simulation (SPEC section 1.2)."""
         return self.valid[..., CURRENT_STEP]

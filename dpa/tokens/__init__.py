@@ -1,0 +1,7 @@
+"""Motion tokens: a decision of 0.5 s as one word of a small vocabulary."""
+
+from dpa.tokens.base import MotionTokenizer, TokenizedTracks
+from dpa.tokens.transform import TokenAction
+from dpa.tokens.verlet import VerletTokenizer
+
+__all__ = ["MotionTokenizer", "TokenAction", "TokenizedTracks", "VerletTokenizer"]

@@ -1,0 +1,101 @@
+"""The contract of a motion tokenizer, and what follows from it for whole tracks."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from envs.geometry.frames import to_local, to_world
+
+
+class TokenizedTracks(NamedTuple):
+    """Tracks as tokens.
+
+    Attributes:
+        tokens: ``[*, A, T]`` int64.
+        valid: ``[*, A, T]`` bool, the token was encoded from logged poses; false from the first hole of a log on.
+        poses: ``[*, A, T * F, 3]``, what the tokens decode to, in the scene's frame.
+    """
+
+    tokens: Tensor
+    valid: Tensor
+    poses: Tensor
+
+
+class MotionTokenizer(nn.Module):
+    """Maps one token to the F next poses of an agent, and back.
+
+    A tokenizer has no memory: what it needs of the past it reads from ``recent``, the poses of the last decision. A
+    subclass gives ``vocab_size``, ``steps`` (F), :meth:`encode` and :meth:`decode`; tables and bin sizes are buffers.
+
+    Attributes:
+        vocab_size: V.
+        steps: F, poses of 0.1 s in one token.
+    """
+
+    vocab_size: int
+    steps: int
+
+    @abstractmethod
+    def encode(self, target: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
+        """The token that comes nearest to a motion.
+
+        Args:
+            target: ``[*, F, 3]`` next poses, in the agent's own current frame.
+            recent: ``[*, F + 1, 3]`` poses of the last decision in any common frame, the current one last.
+            kind: ``[*]`` :class:`~envs.scene.AgentKind`.
+
+        Returns:
+            ``[*]`` int64.
+        """
+
+    @abstractmethod
+    def decode(self, token: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
+        """The motion of a token: ``[*, F, 3]`` poses in the agent's own current frame (arguments as in encode)."""
+
+    def encode_tracks(self, poses: Tensor, valid: Tensor, recent: Tensor, kind: Tensor) -> TokenizedTracks:
+        """Tokenize tracks greedily on the reconstructed track, so that errors do not add up (METHOD section 2).
+
+        A token is valid up to the first decision in which the log misses its last pose.
+
+        Args:
+            poses: ``[*, A, T * F, 3]`` logged poses after the current step.
+            valid: ``[*, A, T * F]`` bool.
+            recent: ``[*, A, F + 1, 3]``.
+            kind: ``[*, A]``.
+        """
+        decisions = poses.unflatten(-2, (-1, self.steps))
+        ends = valid.unflatten(-1, (-1, self.steps))[..., -1]
+        token_valid = ends.cummin(-1).values
+        tokens, tracks = [], []
+        for step in range(decisions.shape[-3]):
+            target = to_local(decisions[..., step, :, :], recent[..., -1:, :])
+            tokens.append(self.encode(target, recent, kind))
+            recent = self.advance(tokens[-1], recent, kind)
+            tracks.append(recent[..., 1:, :])
+        return TokenizedTracks(torch.stack(tokens, -1), token_valid, torch.cat(tracks, -2))
+
+    def decode_tracks(self, tokens: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
+        """Poses of a row of tokens.
+
+        Args:
+            tokens: ``[*, A, T]`` int64.
+            recent: ``[*, A, F + 1, 3]``.
+            kind: ``[*, A]``.
+
+        Returns:
+            ``[*, A, T * F, 3]`` in the frame of ``recent``.
+        """
+        tracks = []
+        for token in tokens.unbind(-1):
+            recent = self.advance(token, recent, kind)
+            tracks.append(recent[..., 1:, :])
+        return torch.cat(tracks, -2)
+
+    def advance(self, token: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
+        """``recent`` after one token: ``[*, F + 1, 3]``."""
+        current = recent[..., -1:, :]
+        return torch.cat((current, to_world(self.decode(token, recent, kind), current)), -2)

@@ -1,0 +1,53 @@
+"""Tokens on the action path of the environment."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import Categorical, Composite
+from torchrl.envs import Transform
+
+from dpa.tokens.base import MotionTokenizer
+from envs import keys
+
+
+class TokenAction(Transform):
+    """Lets an environment of continuous poses be driven by motion tokens.
+
+    On the way in, ``("agents", "token")`` is decoded to ``("agents", "action")`` with the agents' recent poses; the
+    environment itself never hears of tokens.
+
+    Args:
+        tokenizer: what a token means.
+
+    Examples:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from dpa.tokens import VerletTokenizer
+        >>> from envs.sources.synthetic import straight_road
+        >>> from envs.traffic import TrafficEnv
+        >>> env = TransformedEnv(TrafficEnv([straight_road()]), TokenAction(VerletTokenizer()))
+        >>> env.rand_step(env.reset())["agents", "token"].shape
+        torch.Size([1, 2])
+    """
+
+    def __init__(self, tokenizer: MotionTokenizer) -> None:
+        super().__init__(in_keys_inv=[keys.ACTION], out_keys_inv=[keys.TOKEN])
+        self.tokenizer = tokenizer
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = self.tokenizer.decode(tensordict[keys.TOKEN], tensordict[keys.RECENT], tensordict[keys.KIND])
+        return tensordict.set(keys.ACTION, action)
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        action = input_spec["full_action_spec"]
+        poses = action[keys.ACTION]
+        if poses.shape[-2] != self.tokenizer.steps:
+            raise ValueError(
+                f"The environment takes {poses.shape[-2]} poses for a decision and the tokenizer gives "
+                f"{self.tokenizer.steps}; set TrafficEnv(decision_steps={self.tokenizer.steps})."
+            )
+        del action[keys.ACTION]
+        action[keys.TOKEN] = Categorical(
+            self.tokenizer.vocab_size, shape=poses.shape[:-2], device=poses.device, dtype=torch.int64
+        )
+        return input_spec
