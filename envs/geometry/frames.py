@@ -30,7 +30,7 @@ def rotate(vector: Tensor, angle: Tensor) -> Tensor:
 
     Examples:
         >>> rotate(torch.tensor([1.0, 0.0]), torch.tensor(math.pi / 2)).round(decimals=6)
-        tensor([-0.,  1.])
+        tensor([-0., 1.])
     """
     x, y = vector.unbind(-1)
     cos, sin = angle.cos(), angle.sin()

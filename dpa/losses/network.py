@@ -1,0 +1,36 @@
+"""The network that every loss works on, and masked means."""
+
+from __future__ import annotations
+
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+
+CONTEXT = "context"
+LOGITS = "logits"
+
+
+def token_network(model: nn.Module) -> TensorDictModule:
+    """Wrap a model as the network of a loss.
+
+    Args:
+        model: called with a context of batch size ``[S]``, tokens ``[S, M, A, T]`` and their validity
+            ``[S, M or 1, A, T]``; gives logits ``[S, M, A, T, V]`` (:class:`~dpa.policy.MotionLM` does).
+    """
+    return TensorDictModule(model, in_keys=[CONTEXT, "tokens", "token_valid"], out_keys=[LOGITS])
+
+
+def masked_mean(value: Tensor, mask: Tensor) -> Tensor:
+    """Mean of the entries where ``mask`` is true, 0 where none is; ``mask`` is broadcast to ``value``.
+
+    Examples:
+        >>> import torch
+        >>> masked_mean(torch.tensor([1.0, 9.0]), torch.tensor([True, False]))
+        tensor(1.)
+    """
+    mask = mask.expand_as(value)
+    return value.where(mask, value.new_zeros(())).sum() / mask.sum().clamp(min=1)
+
+
+def token_log_prob(logits: Tensor, tokens: Tensor) -> Tensor:
+    """Log-probability of each token [nats]: ``[..., V]`` and ``[...]`` to ``[...]``."""
+    return logits.log_softmax(-1).gather(-1, tokens[..., None])[..., 0]

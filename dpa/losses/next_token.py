@@ -1,0 +1,102 @@
+"""Next-token prediction (METHOD eq. 1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictParams, dispatch
+from torchrl.objectives import LossModule
+
+from dpa.losses.network import CONTEXT, LOGITS, masked_mean
+from envs import keys
+
+
+class NextTokenLoss(LossModule):
+    """Negative log-likelihood of tokens, per valid token [nats] (eq. 1).
+
+    Pre-training reads the tokens of logs; SFT-best reads those of the best rollouts as new labels. Nothing else differs.
+
+    Args:
+        actor_network: from :func:`~dpa.losses.token_network`.
+
+    Keyword Args:
+        label_smoothing: share of the target spread over all tokens.
+
+    Returns ``loss_next_token`` and, detached, ``accuracy`` (share of tokens that are the most probable ones) and ``entropy``
+    [nats].
+
+    Examples:
+        >>> from dpa.losses import token_network
+        >>> from dpa.policy import MotionLM, collate_contexts, make_context
+        >>> from dpa.tokens import VerletTokenizer
+        >>> from envs.sources.synthetic import straight_road
+        >>> loss = NextTokenLoss(token_network(MotionLM("nano", VerletTokenizer())))
+        >>> batch = TensorDict(
+        ...     {
+        ...         "context": collate_contexts([make_context(straight_road(2))]),
+        ...         "tokens": torch.full((1, 1, 2, 16), 84),
+        ...         "token_valid": torch.ones(1, 1, 2, 16, dtype=torch.bool),
+        ...     },
+        ...     batch_size=[1],
+        ... )
+        >>> loss(batch)["loss_next_token"].shape
+        torch.Size([])
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys of the input.
+
+        Attributes:
+            context: :class:`~dpa.policy.SceneContext` of batch size ``[S]``.
+            tokens: ``[S, M, A, T]`` int64.
+            token_valid: ``[S, M or 1, A, T]`` bool.
+        """
+
+        context: NestedKey = CONTEXT
+        tokens: NestedKey = keys.TOKENS
+        token_valid: NestedKey = keys.TOKEN_VALID
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+    actor_network: TensorDictModule
+    actor_network_params: TensorDictParams
+    target_actor_network_params: TensorDictParams
+    out_keys = ["loss_next_token", "accuracy", "entropy"]
+
+    def __init__(self, actor_network: TensorDictModule, *, label_smoothing: float = 0.0) -> None:
+        super().__init__()
+        if not 0 <= label_smoothing < 1:
+            raise ValueError(f"label_smoothing must lie in [0, 1), got {label_smoothing}.")
+        self.convert_to_functional(actor_network, "actor_network", create_target_params=False)
+        self.label_smoothing = label_smoothing
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        accepted = self.tensor_keys
+        return [accepted.context, accepted.tokens, accepted.token_valid]
+
+    def _forward_value_estimator_keys(self, **_: object) -> None:
+        """There is no value estimator."""
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        accepted = self.tensor_keys
+        tokens, valid = tensordict[accepted.tokens], tensordict[accepted.token_valid]
+        batch = TensorDict(
+            {CONTEXT: tensordict[accepted.context], keys.TOKENS: tokens, keys.TOKEN_VALID: valid},
+            batch_size=tokens.shape[:1],
+        )
+        with self.actor_network_params.to_module(self.actor_network):
+            logits = self.actor_network(batch)[LOGITS]
+        log_probs = logits.log_softmax(-1)
+        nll = -log_probs.gather(-1, tokens[..., None])[..., 0]
+        spread = -log_probs.mean(-1)
+        loss = masked_mean((1 - self.label_smoothing) * nll + self.label_smoothing * spread, valid)
+        with torch.no_grad():
+            hit = (logits.argmax(-1) == tokens).to(logits.dtype)
+            entropy = -(log_probs.exp() * log_probs).sum(-1)
+            diagnostics = {"accuracy": masked_mean(hit, valid), "entropy": masked_mean(entropy, valid)}
+        return TensorDict({"loss_next_token": loss, **diagnostics}, batch_size=[])

@@ -1,0 +1,138 @@
+"""Attention that sees relative poses, at the memory of plain attention.
+
+Every token has a pose. Writing ``g`` for the rigid motion of a pose and ``rho(g)`` for its 3 x 3 matrix, the product
+``rho(g_i)^-1 rho(g_j)`` depends on the pose of j seen from i only. So queries, keys and values are split into blocks of
+three channels, each multiplied by the matrix of its OWN token, and the output by the inverse matrix of the query: scores
+and values then hold relative poses, nothing of size (queries x keys) is built but the scores, and keys and values can
+be cached in the frame of the scene (cf. Miyato et al., "GTA", ICLR 2024).
+
+On top each query has a *gaze*: a point that it chooses in its own frame and a width. The log-weight ``-w |c_i - x_j|^2 / 2``
+is linear in features of j up to a term that softmax cancels, so it costs three more channels.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from envs.geometry.frames import rotate
+
+METRES = 10.0
+"""Metres that count as one in the matrices."""
+
+
+class KeyValues(NamedTuple):
+    """Keys and values of tokens, in the frame of the scene.
+
+    Attributes:
+        keys: ``[B, H, n, D + 3]``.
+        values: ``[B, H, n, D]``.
+    """
+
+    keys: Tensor
+    values: Tensor
+
+
+class RelativeAttention(nn.Module):
+    """Multi-head attention between tokens with poses, invariant to moving and turning the scene.
+
+    Args:
+        width: channels of a token.
+        heads: H; ``width`` is a multiple of it.
+        gaze: width of a head's gaze at the start of training [m], from the narrowest head to the widest.
+
+    Raises:
+        ValueError: ``width`` is no multiple of ``heads``.
+
+    Examples:
+        >>> attention = RelativeAttention(32, heads=2)
+        >>> x, pose = torch.randn(1, 5, 32), torch.randn(1, 5, 3)
+        >>> attention(x, pose, attention.remember(x, pose)).shape
+        torch.Size([1, 5, 32])
+    """
+
+    def __init__(self, width: int, heads: int, gaze: tuple[float, float] = (8.0, 60.0)) -> None:
+        super().__init__()
+        if width % heads:
+            raise ValueError(f"width must be a multiple of heads, got {width} and {heads}.")
+        self.heads, self.dim = heads, width // heads
+        self.blocks = self.dim // 4
+        self.query = nn.Linear(width, width)
+        self.key_value = nn.Linear(width, 2 * width)
+        self.gaze = nn.Linear(width, 3 * heads)
+        self.out = nn.Linear(width, width)
+        nn.init.zeros_(self.gaze.weight)
+        nn.init.zeros_(self.gaze.bias)
+        widths = torch.logspace(*torch.tensor(gaze).log10().tolist(), heads)
+        self.register_buffer("precision", widths.pow(-2))
+
+    def remember(self, x: Tensor, pose: Tensor) -> KeyValues:
+        """Keys and values of tokens ``x`` ``[B, n, width]`` at ``pose`` ``[B, n, 3]``."""
+        key, value = self._split(self.key_value(x), 2)
+        pose = pose[:, None]
+        xy = (pose[..., :2] / METRES).expand(*key.shape[:-1], 2)
+        window = torch.cat((xy, -xy.square().sum(-1, keepdim=True) / 2), -1)
+        return KeyValues(torch.cat((self._move(key, pose), window), -1), self._move(value, pose))
+
+    def forward(self, x: Tensor, pose: Tensor, memory: KeyValues, mask: Tensor | None = None) -> Tensor:
+        """Attend from tokens to remembered ones.
+
+        Args:
+            x: ``[B, m, width]`` queries.
+            pose: ``[B, m, 3]``.
+            memory: of n tokens.
+            mask: broadcastable to ``[B, H, m, n]`` bool, true where a query may look.
+
+        Returns:
+            ``[B, m, width]``.
+        """
+        (query,) = self._split(self.query(x), 1)
+        pose = pose[:, None]
+        query = torch.cat((self._query(query, pose), self._gaze(x, pose)), -1)
+        seen = F.scaled_dot_product_attention(query, memory.keys, memory.values, attn_mask=mask, scale=1.0)
+        return self.out(self._back(seen, pose).transpose(1, 2).flatten(2))
+
+    def _split(self, x: Tensor, parts: int) -> tuple[Tensor, ...]:
+        """``[B, n, parts * width]`` to ``parts`` times ``[B, H, n, D]``."""
+        return tuple(x.unflatten(-1, (parts, self.heads, self.dim)).permute(2, 0, 3, 1, 4))
+
+    def _blocks(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Vector part ``[..., blocks, 2]``, weight part ``[..., blocks]`` and the channels without geometry."""
+        vector, weight, rest = x.split((2 * self.blocks, self.blocks, self.dim - 3 * self.blocks), -1)
+        return vector.unflatten(-1, (self.blocks, 2)), weight, rest
+
+    def _move(self, x: Tensor, pose: Tensor) -> Tensor:
+        """Multiply by rho(g): turn the vectors and shift them by weight times position."""
+        vector, weight, rest = self._blocks(x)
+        vector = rotate(vector, pose[..., 2:]) + weight[..., None] * pose[..., None, :2] / METRES
+        return torch.cat((vector.flatten(-2), weight, rest), -1)
+
+    def _query(self, x: Tensor, pose: Tensor) -> Tensor:
+        """Multiply by rho(g)^-T, scaled as in dot-product attention, so that q . k = x^T rho(g_i^-1 g_j) key."""
+        vector, weight, rest = self._blocks(x * self.dim**-0.5)
+        vector = rotate(vector, pose[..., 2:])
+        weight = weight - (vector * pose[..., None, :2] / METRES).sum(-1)
+        return torch.cat((vector.flatten(-2), weight, rest), -1)
+
+    def _back(self, x: Tensor, pose: Tensor) -> Tensor:
+        """Multiply by rho(g)^-1: what was seen, in the frame of the query."""
+        vector, weight, rest = self._blocks(x)
+        vector = rotate(vector - weight[..., None] * pose[..., None, :2] / METRES, -pose[..., 2:])
+        return torch.cat((vector.flatten(-2), weight, rest), -1)
+
+    def _gaze(self, x: Tensor, pose: Tensor) -> Tensor:
+        """``[B, H, m, 3]``: w * (c_x, c_y, 1) for a centre c in the scene's frame, in units of METRES."""
+        offset, width = self.gaze(x).unflatten(-1, (self.heads, 3)).transpose(1, 2).split((2, 1), -1)
+        precision = self.precision[:, None, None] * METRES**2 * width.exp()
+        centre = pose[..., :2] / METRES + rotate(offset, pose[..., 2])
+        return torch.cat((precision * centre, precision), -1)
+
+
+class FeedForward(nn.Sequential):
+    """Two layers with a GELU between them; ``inner`` channels in the middle."""
+
+    def __init__(self, width: int, inner: int) -> None:
+        super().__init__(nn.Linear(width, inner), nn.GELU(), nn.Linear(inner, width))
