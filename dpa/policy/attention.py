@@ -29,7 +29,7 @@ class KeyValues(NamedTuple):
 
     Attributes:
         keys: ``[B, H, n, D + 3]``.
-        values: ``[B, H, n, D]``.
+        values: ``[B, H, n, D + 3]``, the last three 0: fused attention wants keys and values of one width.
     """
 
     keys: Tensor
@@ -75,7 +75,7 @@ class RelativeAttention(nn.Module):
         pose = pose[:, None]
         xy = (pose[..., :2] / METRES).expand(*key.shape[:-1], 2)
         window = torch.cat((xy, -xy.square().sum(-1, keepdim=True) / 2), -1)
-        return KeyValues(torch.cat((self._move(key, pose), window), -1), self._move(value, pose))
+        return KeyValues(torch.cat((self._move(key, pose), window), -1), F.pad(self._move(value, pose), (0, 3)))
 
     def forward(self, x: Tensor, pose: Tensor, memory: KeyValues, mask: Tensor | None = None) -> Tensor:
         """Attend from tokens to remembered ones.
@@ -93,7 +93,7 @@ class RelativeAttention(nn.Module):
         pose = pose[:, None]
         query = torch.cat((self._query(query, pose), self._gaze(x, pose)), -1)
         seen = F.scaled_dot_product_attention(query, memory.keys, memory.values, attn_mask=mask, scale=1.0)
-        return self.out(self._back(seen, pose).transpose(1, 2).flatten(2))
+        return self.out(self._back(seen[..., : self.dim], pose).transpose(1, 2).flatten(2))
 
     def _split(self, x: Tensor, parts: int) -> tuple[Tensor, ...]:
         """``[B, n, parts * width]`` to ``parts`` times ``[B, H, n, D]``."""

@@ -168,7 +168,7 @@ class NodeCache:
 
     def __init__(self, layers: int, shape: tuple[int, int, int, int], dim: int, like: Tensor) -> None:
         self.keys = [like.new_zeros(*shape, dim + 3) for _ in range(layers)]
-        self.values = [like.new_zeros(*shape, dim) for _ in range(layers)]
+        self.values = [like.new_zeros(*shape, dim + 3) for _ in range(layers)]
         batch, _, horizon, agents = shape
         self.valid = torch.zeros(batch, horizon, agents, dtype=torch.bool, device=like.device)
 

@@ -1,1 +1,12 @@
-"""Raw files to :class:`~envs.scene.Scene`: one module for each source."""
+"""Raw files to :class:`~envs.scene.Scene`: one module for each source, all listed in :data:`SOURCES`."""
+
+from __future__ import annotations
+
+from envs.sources.gpudrive import GPUDRIVE
+from envs.sources.source import Source, Unit
+from envs.sources.womd import WOMD
+
+SOURCES: dict[str, Source] = {source.name: source for source in (WOMD, GPUDRIVE)}
+"""Every source that ``python -m envs.convert`` knows, by name."""
+
+__all__ = ["SOURCES", "Source", "Unit"]

@@ -1,0 +1,43 @@
+"""Look at a preference store: ``python -m dpa.preferences info STORE`` or ``... verify STORE``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from dpa.preferences.card import data_card
+from dpa.preferences.store import PreferenceStore, verify
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; the exit status is 1 for a problem in the store."""
+    parser = argparse.ArgumentParser(prog="python -m dpa.preferences", description="Look at a preference store.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    info = commands.add_parser("info", help="print the data card and where the groups come from")
+    info.add_argument("--pairs", type=int, help="pairs per scene (default: a quarter of the rollouts)")
+    check = commands.add_parser("verify", help="compare every file with its checksum")
+    for command in (info, check):
+        command.add_argument("store", type=Path, help="folder of the store")
+    options = parser.parse_args(arguments)
+    try:
+        return _info(options.store, options.pairs) if options.command == "info" else _verify(options.store)
+    except ValueError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+
+
+def _info(folder: Path, pairs: int | None) -> int:
+    store = PreferenceStore(folder)
+    sys.stdout.write(f"{data_card(store, pairs)}\n\norigin\n{store.provenance.to_json()}\n")
+    return 0
+
+
+def _verify(folder: Path) -> int:
+    problems = verify(folder)
+    sys.stdout.write("\n".join(problems or [f"{folder}: every chunk matches its checksums."]) + "\n")
+    return 1 if problems else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

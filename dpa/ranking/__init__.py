@@ -1,0 +1,30 @@
+"""Ranking of rollouts by how near they come to the log.
+
+``features`` (phi of the paper) and ``transport`` (optimal transport) make the preference distance of ``distance``;
+``displacement`` is its rival; ``transform`` puts both behind a collector.
+"""
+
+from dpa.ranking.displacement import Displacement, average_displacement
+from dpa.ranking.distance import AGGREGATES, PreferenceDistance, Ranking, rank_of
+from dpa.ranking.features import FEATURE_SETS, FEATURES, Feature, Motion, log_trajectory, occupancy_features, register
+from dpa.ranking.transport import SOLVERS, Transport, feature_shares, transport_cost
+
+__all__ = [
+    "AGGREGATES",
+    "FEATURES",
+    "FEATURE_SETS",
+    "SOLVERS",
+    "Displacement",
+    "Feature",
+    "Motion",
+    "PreferenceDistance",
+    "Ranking",
+    "Transport",
+    "average_displacement",
+    "feature_shares",
+    "log_trajectory",
+    "occupancy_features",
+    "rank_of",
+    "register",
+    "transport_cost",
+]

@@ -1,0 +1,232 @@
+"""What the realism metric measures of every evaluated agent, at each step, in the log and in the rollouts.
+
+Sections refer to the specification of the Waymo Open Sim Agents metric (SPEC). The log is treated as one more rollout,
+so everything is computed once for ``C = R + 1`` scenes, the log first.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dpa.realism.config import RealismConfig
+from dpa.realism.lights import red_light_violation
+from envs.geometry.boxes import nearest_box_distance
+from envs.geometry.edges import RoadEdges
+from envs.geometry.frames import rotate, wrap_angle
+from envs.scene import CURRENT_STEP, EDGE_KINDS, LOG_STEPS, STEP_SECONDS, AgentKind, Scene, polylines, select_agents
+
+HORIZON = LOG_STEPS - CURRENT_STEP - 1
+"""Simulated steps, and steps that are scored."""
+
+_CONTEXT = 2
+"""Logged steps ahead of the scored ones that their differences reach back to (SPEC section 2.2)."""
+_OFF_MAP = -1e10
+"""Distance to the road edge of an agent that is not there [m]."""
+
+_LONGEST_TTC = 5.0
+"""Time to collision is cut at this value [s]."""
+_FOLLOW_ANGLE = math.radians(75)
+"""A leader's heading differs by at most this angle [rad]."""
+_FOLLOW_ANGLE_SMALL_OVERLAP = math.radians(10)
+"""The same where the two overlap sideways by less than :data:`_SMALL_OVERLAP` [rad]."""
+_SMALL_OVERLAP = 0.5
+"""Overlap sideways below which a leader must be nearly parallel [m]."""
+
+
+@dataclass(frozen=True)
+class Features:
+    """Measurements of E evaluated agents in ascending order of track id.
+
+    Attributes:
+        values: name to ``[C, E, 80]``; float for continuous features, bool for ``collision_per_step``,
+            ``offroad_per_step`` and, if asked for, ``traffic_light_violation_per_step``.
+        displacement: ``[R, E]``, mean distance from the log over all 91 steps [m].
+        valid: ``[E, 80]`` bool, the agent is there in the log.
+        vehicle: ``[E]`` bool.
+        track_id: ``[E]`` int64.
+    """
+
+    values: dict[str, Tensor]
+    displacement: Tensor
+    valid: Tensor
+    vehicle: Tensor
+    track_id: Tensor
+
+
+@dataclass(frozen=True)
+class _Tracks:
+    """C scenes of A simulated agents over the scored steps and their context, ``L = 82``.
+
+    Attributes:
+        position: ``[C, A, L, 3]``.
+        heading: ``[C, A, L]``.
+        valid: ``[C, A, L]`` bool.
+        extent: ``[A, 3]``.
+        ego: ``[E]`` int64, the evaluated agents.
+    """
+
+    position: Tensor
+    heading: Tensor
+    valid: Tensor
+    extent: Tensor
+    ego: Tensor
+
+
+def measure(scene: Scene, simulated: Tensor, config: RealismConfig) -> Features:
+    """Measure the log and the rollouts of one uncollated scene.
+
+    Args:
+        scene: the scene; agents that are not present at the current step take no part.
+        simulated: ``[R, A, 80, 4]``, x, y, z, heading of the present agents in their order.
+        config: which options apply.
+    """
+    scene, simulated = in_world(scene, simulated)
+    scene = select_agents(scene, scene.agents.present)
+    agents = scene.agents
+    ego = agents.evaluated.nonzero()[:, 0]
+    ego = ego[agents.track_id[ego].argsort()]
+    tracks = _join(scene, simulated, ego)
+    distance = _nearest_object(tracks, config.corner_rounding)
+    road_edge = _road_edge(tracks, RoadEdges.from_polylines(polylines(scene, EDGE_KINDS)))
+    values = {
+        **_kinematics(tracks),
+        "distance_to_nearest_object": distance,
+        "collision_per_step": distance < 0,
+        "time_to_collision": _time_to_collision(tracks),
+        "distance_to_road_edge": road_edge,
+        "offroad_per_step": road_edge > 0,
+    }
+    if config.traffic_lights:
+        # a crossing compares a step with the one before it
+        steps = slice(_CONTEXT - 1, None)
+        position, valid = tracks.position[:, ego, steps, :2], tracks.valid[:, ego, steps]
+        values["traffic_light_violation_per_step"] = red_light_violation(scene, position, valid)
+    return Features(
+        values=values,
+        displacement=_displacement(scene, simulated, ego),
+        valid=agents.valid[ego, -HORIZON:],
+        vehicle=agents.kind[ego] == AgentKind.VEHICLE,
+        track_id=agents.track_id[ego],
+    )
+
+
+def in_world(scene, simulated):
+    origin = scene.origin.clone()
+    def move(points):
+        return (points.double() + origin).float()
+    scene = scene.clone()
+    scene.agents.position = torch.where(scene.agents.valid[..., None], move(scene.agents.position), 0)
+    scene.agents.heading = torch.where(scene.agents.valid, scene.agents.heading, 0)
+    scene.road.points = move(scene.road.points)
+    scene.lights.stop_point = torch.where((scene.lights.state == -1)[..., None], 0, move(scene.lights.stop_point))
+    scene.origin = torch.zeros_like(scene.origin)
+    return scene, torch.cat((move(simulated[..., :3]), simulated[..., 3:]), -1)
+
+
+def _join(scene: Scene, simulated: Tensor, ego: Tensor) -> _Tracks:
+    """Put the log, then the rollouts behind their logged context, side by side (SPEC section 1.6)."""
+    agents = scene.agents
+    steps = slice(-HORIZON - _CONTEXT, None)
+    valid = agents.valid[:, steps]
+    position, heading = agents.position[:, steps], agents.heading[:, steps]
+
+    rollouts = simulated.shape[0]
+    context = position[:, :_CONTEXT].expand(rollouts, -1, -1, -1)
+    heading_context = heading[:, :_CONTEXT].expand(rollouts, -1, -1)
+    simulated_valid = valid.clone()
+    simulated_valid[:, _CONTEXT:] = True
+    return _Tracks(
+        position=torch.cat((position[None], torch.cat((context, simulated[..., :3]), 2))),
+        heading=torch.cat((heading[None], torch.cat((heading_context, simulated[..., 3]), 2))),
+        valid=torch.cat((valid[None], simulated_valid.expand(rollouts, -1, -1))),
+        extent=agents.extent,
+        ego=ego,
+    )
+
+
+def _central_difference(value: Tensor) -> Tensor:
+    """Half the difference of the two neighbours along the last dim; NaN at both ends."""
+    inside = (value[..., 2:] - value[..., :-2]) / 2
+    return torch.nn.functional.pad(inside, (1, 1), value=torch.nan)
+
+
+def _kinematics(tracks: _Tracks) -> dict[str, Tensor]:
+    """Speeds and accelerations of the evaluated agents (SPEC section 2)."""
+    position, heading = tracks.position[:, tracks.ego], tracks.heading[:, tracks.ego]
+    speed = _speed(position)
+    turn = _turn(heading)
+    values = {
+        "linear_speed": speed,
+        "linear_acceleration": _central_difference(speed) / STEP_SECONDS,
+        "angular_speed": turn / STEP_SECONDS,
+        "angular_acceleration": _turn(turn) / STEP_SECONDS**2,
+    }
+    return {name: value[..., _CONTEXT:] for name, value in values.items()}
+
+
+def _speed(position: Tensor) -> Tensor:
+    """Speed from positions in two or three dims: ``[..., L, D]`` -> ``[..., L]`` [m/s]."""
+    step = _central_difference(position.transpose(-1, -2))
+    return step.square().sum(-2).sqrt() / STEP_SECONDS
+
+
+def _turn(angle: Tensor) -> Tensor:
+    """Central difference of an angle, wrapped over the two steps that it spans [rad]."""
+    return wrap_angle(2 * _central_difference(angle)) / 2
+
+
+def _nearest_object(tracks: _Tracks, rounding: float) -> Tensor:
+    """Signed distance of the evaluated agents to the nearest other box (SPEC section 3.1) -> ``[C, E, 80]`` [m]."""
+    scenes = tracks.position.shape[0]
+    size = tracks.extent[:, None, :2].expand(scenes, -1, HORIZON, -1)
+    pose = torch.cat((tracks.position[..., :2], tracks.heading[..., None]), -1)[:, :, _CONTEXT:]
+    boxes = torch.cat((pose, size), -1).transpose(1, 2)
+    valid = tracks.valid[:, :, _CONTEXT:].transpose(1, 2)
+    return nearest_box_distance(boxes, valid, tracks.ego, rounding).transpose(1, 2)
+
+
+def _time_to_collision(tracks: _Tracks) -> Tensor:
+    """Time until each evaluated agent reaches its leader at the present speeds (SPEC section 3.2) -> ``[C, E, 80]`` [s]."""
+    speed = _speed(tracks.position[..., :2])[..., _CONTEXT:]
+    position, heading = tracks.position[:, :, _CONTEXT:, :2], tracks.heading[:, :, _CONTEXT:]
+    valid = tracks.valid[:, :, _CONTEXT:]
+    length, width = tracks.extent[:, 0, None], tracks.extent[:, 1, None]
+    result = []
+    for ego in tracks.ego.tolist():
+        # not wrapped in the official code: headings of +3.1 and -3.1 count as 6.2 rad apart
+        turn = (heading - heading[:, ego, None]).abs()
+        cos, sin = turn.cos().abs(), turn.sin().abs()
+        ahead, aside = rotate(position - position[:, ego, None], -heading[:, ego, None]).unbind(-1)
+        gap = ahead - length[ego] / 2 - (length * cos + width * sin) / 2
+        overlap = aside.abs() - width[ego] / 2 - (length * sin + width * cos) / 2
+        aligned = (turn <= _FOLLOW_ANGLE) & ((overlap < -_SMALL_OVERLAP) | (turn <= _FOLLOW_ANGLE_SMALL_OVERLAP))
+        followed = (gap > 0) & (overlap < 0) & aligned & valid
+        nearest, leader = torch.where(followed, gap, torch.inf).min(1)
+        closing = speed[:, ego] - speed.gather(1, leader[:, None])[:, 0]
+        result.append(torch.where(closing > 0, (nearest / closing).clamp(max=_LONGEST_TTC), _LONGEST_TTC))
+    return torch.stack(result, 1)
+
+
+def _road_edge(tracks: _Tracks, edges: RoadEdges) -> Tensor:
+    """Signed distance of the evaluated agents to the road edge (SPEC section 4.1) -> ``[C, E, 80]`` [m]."""
+    position = tracks.position[:, tracks.ego, _CONTEXT:]
+    heading = tracks.heading[:, tracks.ego, _CONTEXT:]
+    valid = tracks.valid[:, tracks.ego, _CONTEXT:]
+    extent = tracks.extent[tracks.ego, None].expand(position.shape)
+    result = position.new_full(valid.shape, _OFF_MAP)
+    result[valid] = edges.box_offroad_distance(position[valid], heading[valid], extent[valid])
+    return result
+
+
+def _displacement(scene: Scene, simulated: Tensor, ego: Tensor) -> Tensor:
+    """Mean distance from the log (SPEC section 5) -> ``[R, E]`` [m].
+
+    The official mean runs over all 91 steps, although the eleven of history cannot differ.
+    """
+    position, valid = scene.agents.position[ego], scene.agents.valid[ego]
+    error = (simulated[:, ego, :, :3] - position[:, -HORIZON:]).norm(dim=-1)
+    return (error * valid[:, -HORIZON:]).sum(-1) / valid.sum(-1)

@@ -1,0 +1,138 @@
+"""Driving through red lights, as the 2025 challenge counts it (SPEC section 4.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from envs.scene import CURRENT_STEP, LightState, MapKind, Scene
+
+_RED = (LightState.ARROW_STOP, LightState.STOP)
+_DISTANCES_PER_CHUNK = 1 << 20
+
+
+@dataclass(frozen=True)
+class _Lanes:
+    """Segments of the surface streets in map order.
+
+    Attributes:
+        start: ``[W, 2]`` [m].
+        delta: ``[W, 2]`` [m].
+        owner: ``[W]`` int64, ``feature_id`` of the lane.
+    """
+
+    start: Tensor
+    delta: Tensor
+    owner: Tensor
+
+
+def red_light_violation(scene: Scene, position: Tensor, valid: Tensor) -> Tensor:
+    """Steps at which agents pass the stop point of the lane that they are on while its light is red.
+
+    Args:
+        scene: an uncollated scene, for its lanes and lights.
+        position: ``[C, E, 81, 2]``, centres from the current step on [m].
+        valid: ``[C, E, 81]`` bool.
+
+    Returns:
+        ``[C, E, 80]`` bool, for the steps after the current one.
+    """
+    violation = torch.zeros_like(valid[..., 1:])
+    lanes = _surface_lanes(scene)
+    if lanes is None:
+        return violation
+    lane_ids, states, stops = _signals(scene)
+    passed, lane = [], []
+    for lane_id, state, stop in zip(lane_ids, states, stops, strict=True):
+        own = lanes.owner == lane_id
+        if own.any():
+            red = torch.isin(state, torch.tensor(_RED, device=state.device))[1:]
+            passed.append(_passes(position, stop, lanes.start[own], lanes.delta[own]) & red & valid[..., 1:])
+            lane.append(lane_id)
+    if not passed:
+        return violation
+    # The lane that an agent is on is costly to find and matters only where it passes some red light.
+    red_pass = torch.stack(passed, -1)
+    where = red_pass.any(-1)
+    current = _current_lane(position[..., 1:, :][where], lanes)
+    violation[where] = (red_pass[where] & (current[:, None] == torch.stack(lane))).any(-1)
+    return violation
+
+
+def _surface_lanes(scene: Scene) -> _Lanes | None:
+    """Lanes as the official code sees them, which pads each to the longest one with zeros.
+
+    Every shorter lane so gains a segment from its last point to the origin of the world.
+    """
+    road = scene.road
+    index = ((road.kind == MapKind.LANE_SURFACE_STREET) & (road.count >= 2)).nonzero()[:, 0]
+    if not len(index):
+        return None
+    world_origin = -scene.origin[None, :2].to(road.points.dtype)
+    longest = int(road.count[index].max())
+    lines = []
+    for start, count in zip(road.start[index].tolist(), road.count[index].tolist(), strict=True):
+        points = road.points[start : start + count, :2]
+        lines.append(torch.cat((points, world_origin)) if count < longest else points)
+    segments = torch.tensor([len(line) - 1 for line in lines], device=index.device)
+    return _Lanes(
+        start=torch.cat([line[:-1] for line in lines]),
+        delta=torch.cat([line[1:] - line[:-1] for line in lines]),
+        owner=road.feature_id[index].repeat_interleave(segments),
+    )
+
+
+def _signals(scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
+    """Lanes ``[G]``, states ``[G, 81]`` and stop points ``[G, 81, 2]`` from the current step on.
+
+    Where a step does not list a lane, the official code has an unknown state and the origin of the world.
+    """
+    lights = scene.lights
+    state = lights.state[:, CURRENT_STEP:]
+    absent = state == LightState.ABSENT
+    world_origin = -scene.origin[:2].to(lights.stop_point.dtype)
+    stop = torch.where(absent[..., None], world_origin, lights.stop_point[:, CURRENT_STEP:, :2])
+    return lights.lane_id, torch.where(absent, int(LightState.UNKNOWN), state), stop
+
+
+def _passes(position: Tensor, stop: Tensor, start: Tensor, delta: Tensor) -> Tensor:
+    """Agents go from behind the stop point of one lane to beyond it.
+
+    Args:
+        position: ``[C, E, 81, 2]``.
+        stop: ``[81, 2]``, stop point of the lane.
+        start: ``[W', 2]``, segments of the lane.
+        delta: ``[W', 2]``.
+
+    Returns:
+        ``[C, E, 80]`` bool.
+    """
+    segment = _odd_distance(stop, start, delta).argmin(-1)
+    start, delta = start[segment], delta[segment]
+    at_stop, at_agent = _along(stop, start, delta), _along(position, start, delta)
+    return (at_agent < at_stop)[..., :-1] & (at_agent > at_stop)[..., 1:]
+
+
+def _current_lane(points: Tensor, lanes: _Lanes) -> Tensor:
+    """``feature_id`` of the lane that each point is on, the first in map order on ties: ``[n, 2]`` -> ``[n]``."""
+    rows = max(1, _DISTANCES_PER_CHUNK // len(lanes.start))
+    nearest = [_odd_distance(part, lanes.start, lanes.delta).argmin(-1) for part in points.split(rows)]
+    return lanes.owner[torch.cat(nearest)]
+
+
+def _odd_distance(points: Tensor, start: Tensor, delta: Tensor) -> Tensor:
+    """What the official code takes for the distance from points to segments: ``[n, 2]``, ``[W, 2]`` -> ``[n, W]``.
+
+    It adds the projection where it should subtract it.
+    """
+    points = points[:, None]
+    t = _along(points, start, delta).clamp(0, 1)
+    return (points - start + t[..., None] * delta).norm(dim=-1)
+
+
+def _along(points: Tensor, start: Tensor, delta: Tensor) -> Tensor:
+    """Position of points along segments, 0 at the start and 1 at the end; 0 for a segment without length."""
+    squared = delta.square().sum(-1)
+    return torch.where(squared > 0, ((points - start) * delta).sum(-1) / squared, 0)

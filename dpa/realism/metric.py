@@ -1,0 +1,245 @@
+"""From measurements to the realism meta-metric of the Waymo Open Sim Agents Challenge (SPEC section 7)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from dpa.realism.config import BUCKETS, RealismConfig
+from dpa.realism.estimators import histogram_log_likelihood, indicator_log_likelihood
+from dpa.realism.features import HORIZON, Features, measure
+from envs.scene import Scene
+
+_EVENTS = {
+    "collision_indication": "collision_per_step",
+    "offroad_indication": "offroad_per_step",
+    "traffic_light_violation": "traffic_light_violation_per_step",
+}
+_RATES = {
+    "collision_rate": "collision_per_step",
+    "offroad_rate": "offroad_per_step",
+    "traffic_light_violation_rate": "traffic_light_violation_per_step",
+}
+
+
+@dataclass(frozen=True)
+class RealismResult:
+    """Realism of the rollouts of a scene, or the mean over scenes.
+
+    Attributes:
+        realism: the meta-metric, 0 to 1.
+        kinematic: weighted mean of the likelihoods of speeds and accelerations.
+        interactive: that of distances, collisions and time to collision.
+        map_based: that of the road edge, off-road and, in 2025, red lights.
+        likelihood: of each scored metric, by name.
+        rate: part of (rollout, agent) pairs with an event, by name: ``collision_rate``, ``offroad_rate`` and, in 2025,
+            ``traffic_light_violation_rate``.
+        min_ade: mean displacement of the best rollout, history included as in the official code [m].
+        ade: mean displacement of all rollouts [m].
+        scenes: how many scenes the values are the mean of.
+        features: what was measured, if asked for.
+    """
+
+    realism: float
+    kinematic: float
+    interactive: float
+    map_based: float
+    likelihood: Mapping[str, float]
+    rate: Mapping[str, float]
+    min_ade: float
+    ade: float
+    scenes: int = 1
+    features: Features | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def collision_rate(self) -> float:
+        """Part of (rollout, agent) pairs with a collision."""
+        return self.rate["collision_rate"]
+
+    @property
+    def offroad_rate(self) -> float:
+        """Part of (rollout, agent) pairs that leave the road."""
+        return self.rate["offroad_rate"]
+
+    def as_dict(self) -> dict[str, float]:
+        """All figures in one flat dictionary; likelihoods end in ``_likelihood``."""
+        return {
+            "realism": self.realism,
+            "kinematic": self.kinematic,
+            "interactive": self.interactive,
+            "map_based": self.map_based,
+            "min_ade": self.min_ade,
+            "ade": self.ade,
+            **self.rate,
+            **{f"{name}_likelihood": value for name, value in self.likelihood.items()},
+        }
+
+
+@torch.no_grad()
+def realism(
+    scene: Scene, simulated: Tensor, config: str | Path | RealismConfig = "2024", *, features: bool = False
+) -> RealismResult:
+    """Score rollouts of one scene.
+
+    The evaluated agents are the SDC and the tracks to predict, as far as they are present at the current step; all
+    present agents are obstacles. A likelihood over no step at all is NaN, and so is the meta-metric then.
+
+    Args:
+        scene: one uncollated scene.
+        simulated: ``[R, A, 80, 4]``, x, y, z, heading of steps 11 to 90 in the scene's frame, where A are the agents
+            with ``scene.agents.present``, in that order. The standard is R = 32.
+        config: the year, a path or a :class:`RealismConfig`.
+        features: also return what was measured.
+
+    Raises:
+        ValueError: the shape does not fit the scene, or a value is not finite.
+
+    Examples:
+        >>> from envs.sources.synthetic import straight_road
+        >>> scene = straight_road(num_vehicles=3, seed=0)
+        >>> log = torch.cat((scene.agents.position, scene.agents.heading[..., None]), -1)[None, :, 11:]
+        >>> result = realism(scene, log.expand(32, -1, -1, -1))
+        >>> result.min_ade, result.collision_rate
+        (0.0, 0.0)
+    """
+    config = config if isinstance(config, RealismConfig) else RealismConfig.load(config)
+    _check(scene, simulated)
+    measured = measure(scene, simulated.to(scene.agents.position.dtype), config)
+    likelihood = {**_histogram_likelihoods(measured, config), **_indicator_likelihoods(measured, config)}
+    weights = config.weights
+    displacement = measured.displacement
+    return RealismResult(
+        realism=sum(weights[name] * value for name, value in likelihood.items()),
+        likelihood=likelihood,
+        rate=_rates(measured),
+        min_ade=displacement.mean(1).min().item(),
+        ade=displacement.mean().item(),
+        features=measured if features else None,
+        **{bucket: _weighted_mean(likelihood, weights, names) for bucket, names in BUCKETS.items()},
+    )
+
+
+def mean_result(results: Sequence[RealismResult]) -> RealismResult:
+    """Mean of every figure over scenes, as the challenge averages (each scene counts the same).
+
+    Args:
+        results: of single scenes or of groups of them, all of one configuration.
+
+    Raises:
+        ValueError: there are none, or they score different metrics.
+
+    Examples:
+        >>> one = RealismResult(0.2, 0.2, 0.2, 0.2, {}, {}, 1.0, 2.0)
+        >>> mean_result([one, RealismResult(0.4, 0.4, 0.4, 0.4, {}, {}, 3.0, 4.0, scenes=3)]).min_ade
+        2.5
+    """
+    if not results:
+        raise ValueError("the mean of no results is not defined; give at least one.")
+    names = {tuple(result.as_dict()) for result in results}
+    if len(names) > 1:
+        raise ValueError(f"results of different configurations cannot be averaged: their figures are {sorted(names)}.")
+    total = sum(result.scenes for result in results)
+
+    def mean(values: Sequence[float]) -> float:
+        return sum(value * result.scenes for value, result in zip(values, results, strict=True)) / total
+
+    def mean_of(attribute: str) -> float:
+        return mean([getattr(result, attribute) for result in results])
+
+    def mean_by_name(attribute: str) -> dict[str, float]:
+        return {name: mean([getattr(r, attribute)[name] for r in results]) for name in getattr(results[0], attribute)}
+
+    return RealismResult(
+        likelihood=mean_by_name("likelihood"),
+        rate=mean_by_name("rate"),
+        scenes=total,
+        **{name: mean_of(name) for name in ("realism", *BUCKETS, "min_ade", "ade")},
+    )
+
+
+def _check(scene: Scene, simulated: Tensor) -> None:
+    agents = int(scene.agents.present.sum())
+    if simulated.ndim != 4 or not len(simulated) or simulated.shape[1:] != (agents, HORIZON, 4):
+        raise ValueError(
+            f"scene {scene.scene_id}: rollouts must have shape [R, {agents}, {HORIZON}, 4] (rollouts, agents present at "
+            f"the current step, steps, x y z heading) with R >= 1, got {list(simulated.shape)}."
+        )
+    finite = torch.isfinite(simulated)
+    if not finite.all():
+        rollout, agent, step, column = (~finite).nonzero()[0].tolist()
+        track = int(scene.agents.track_id[scene.agents.present][agent])
+        value = simulated[rollout, agent, step, column].item()
+        raise ValueError(
+            f"scene {scene.scene_id}: rollout {rollout} has {'xyz'[column] if column < 3 else 'heading'} = {value} for "
+            f"track {track} at simulated step {step}; every present agent needs a finite state at every step."
+        )
+
+
+def _histogram_likelihoods(measured: Features, config: RealismConfig) -> dict[str, float]:
+    """Likelihood of each continuous feature, one mean over the valid steps of all agents."""
+    masks = _masks(measured, config)
+    result = {}
+    for name, histogram in config.histograms.items():
+        value = measured.values[name]
+        score = histogram_log_likelihood(value[0], value[1:], histogram)
+        mask = masks[name]
+        result[name] = (torch.where(mask, score, 0).sum() / mask.sum()).exp().item()
+    return result
+
+
+def _masks(measured: Features, config: RealismConfig) -> dict[str, Tensor]:
+    """Steps ``[E, 80]`` at which the log of each continuous feature counts."""
+    valid = measured.valid
+    speed = _both_neighbours(valid)
+    acceleration = _both_neighbours(speed)
+    return {
+        "linear_speed": speed,
+        "angular_speed": speed,
+        "linear_acceleration": acceleration,
+        "angular_acceleration": acceleration,
+        "distance_to_nearest_object": valid,
+        "distance_to_road_edge": valid,
+        "time_to_collision": valid & measured.vehicle[:, None] if config.ttc_vehicle_only else valid,
+    }
+
+
+def _both_neighbours(valid: Tensor) -> Tensor:
+    """Steps whose central difference is valid (SPEC section 2.3): ``[E, T]`` -> ``[E, T]``."""
+    result = torch.zeros_like(valid)
+    result[:, 1:-1] = valid[:, :-2] & valid[:, 2:]
+    return result
+
+
+def _indicator_likelihoods(measured: Features, config: RealismConfig) -> dict[str, float]:
+    """Likelihood of each event, one mean over all evaluated agents."""
+    result = {}
+    for name, indicator in config.indicators.items():
+        if _EVENTS[name] not in measured.values:
+            continue
+        happened = _happened(measured, _EVENTS[name])
+        if name == "traffic_light_violation":
+            happened = happened & measured.vehicle
+        result[name] = indicator_log_likelihood(happened[0], happened[1:], indicator).mean().exp().item()
+    return result
+
+
+def _rates(measured: Features) -> dict[str, float]:
+    return {
+        name: _happened(measured, event)[1:].float().mean().item()
+        for name, event in _RATES.items()
+        if event in measured.values
+    }
+
+
+def _happened(measured: Features, event: str) -> Tensor:
+    """``[C, E]`` bool: the event happened at some step at which the agent is there in the log."""
+    return (measured.values[event] & measured.valid).any(-1)
+
+
+def _weighted_mean(likelihood: Mapping[str, float], weights: Mapping[str, float], names: Sequence[str]) -> float:
+    scored = [name for name in names if name in likelihood]
+    return sum(weights[name] * likelihood[name] for name in scored) / sum(weights[name] for name in scored)

@@ -1,0 +1,192 @@
+"""Means and paired differences with bootstrap intervals over training seeds and scenes.
+
+Every method is evaluated on the same scenes, so a method is compared with the reference scene by scene: the spread
+between easy and hard scenes, which is far larger than any gain, cancels. What is left is resampled at both levels that
+were sampled: the training runs (seeds) and the scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+SCENES, SEEDS_AND_SCENES = "scenes", "seeds and scenes"
+_COUNTS_AT_ONCE = 10_000_000
+"""Bound on the counts (resamples x scenes) held at one time: 80 MB."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A mean with its 95 % interval.
+
+    Attributes:
+        mean: over seeds and scenes.
+        low: 2.5 % quantile of the resampled means.
+        high: 97.5 % quantile.
+        over: ``"scenes"`` for one seed (the interval then knows nothing of the spread between training runs) or
+            ``"seeds and scenes"``.
+        num_seeds: training runs.
+        num_scenes: scenes.
+    """
+
+    mean: float
+    low: float
+    high: float
+    over: str
+    num_seeds: int
+    num_scenes: int
+
+    @property
+    def excludes_zero(self) -> bool:
+        """Zero lies outside the interval: a difference may be claimed."""
+        return self.low > 0 or self.high < 0
+
+
+def paired_bootstrap(
+    values: ArrayLike, reference: ArrayLike, num_resamples: int = 10_000, *, seed: int = 0
+) -> Interval:
+    """Mean of ``values - reference`` and its interval, by a hierarchical percentile bootstrap.
+
+    A resample draws seeds with replacement, then scenes with replacement. All seeds saw the same scenes, so one draw of
+    scenes serves all seeds of a resample: what a scene does to every run stays a source of error.
+
+    The percentile bootstrap is a little narrow for few units. Simulated with 54 scenes (standard deviation .03 of a
+    scene's difference, .03 of noise) and training runs that differ by .01, the 95 % interval held the true gain in 63 %
+    of cases with 1 seed, 87 % with 2, 91 % with 3 and 94 % with 5: one seed cannot carry a claim about a method.
+
+    Args:
+        values: ``[seeds, scenes]``, one row for each training run of the method.
+        reference: ``[seeds, scenes]``, the run with which each row is paired, or ``[1, scenes]``, one for all.
+        num_resamples: bootstrap draws.
+        seed: of the draws.
+
+    Raises:
+        ValueError: shapes that do not pair, no scene, or a value that is not finite.
+
+    Examples:
+        >>> paired_bootstrap([[0.7, 0.8, 0.6]], [[0.6, 0.7, 0.5]], num_resamples=100).mean.__round__(3)
+        0.1
+        >>> paired_bootstrap([[0.7, 0.8, 0.6]], [[0.6, 0.7, 0.5]], num_resamples=100).over
+        'scenes'
+    """
+    mine, other = _checked(values, "values"), _checked(reference, "reference")
+    if mine.shape[1] != other.shape[1] or other.shape[0] not in (1, mine.shape[0]):
+        raise ValueError(
+            f"values {list(mine.shape)} and reference {list(other.shape)} do not pair: both must have the same scenes "
+            f"in the same order, and the reference one row or one for each of the {mine.shape[0]} seeds."
+        )
+    return _bootstrap(mine - other, num_resamples, seed)
+
+
+def summary(values: ArrayLike, num_resamples: int = 10_000, *, seed: int = 0) -> Interval:
+    """Mean of one method and its interval, resampled like :func:`paired_bootstrap`.
+
+    Args:
+        values: ``[seeds, scenes]``.
+        num_resamples: bootstrap draws.
+        seed: of the draws.
+
+    Raises:
+        ValueError: no scene, or a value that is not finite.
+
+    Examples:
+        >>> summary([[1.0, 1.0], [1.0, 1.0]])
+        Interval(mean=1.0, low=1.0, high=1.0, over='seeds and scenes', num_seeds=2, num_scenes=2)
+    """
+    return _bootstrap(_checked(values, "values"), num_resamples, seed)
+
+
+def compare_methods(
+    per_scene: Mapping[str, Mapping[str, Sequence[float]]],
+    reference: str,
+    num_resamples: int = 10_000,
+    *,
+    seed: int = 0,
+) -> list[dict]:
+    """The ``paired`` entries of a comparison: every method against the reference.
+
+    Args:
+        per_scene: ``{method: {seed: realism of each evaluation scene}}``, all methods with the same scenes in the same
+            order. A method's seeds are paired with the reference's seeds of the same name, or all with its only seed.
+        reference: name of the reference method.
+        num_resamples: bootstrap draws.
+        seed: of the draws.
+
+    Returns:
+        ``{"method", "realism_difference", "ci95": [low, high], "over", "n_seeds"}`` for each method, in order.
+
+    Raises:
+        ValueError: the reference is missing, or seeds or scenes do not pair; the message names the method.
+
+    Examples:
+        >>> scores = {"reference": {"0": [0.6, 0.7]}, "DPA-OMF": {"0": [0.7, 0.8], "1": [0.7, 0.8]}}
+        >>> entry = compare_methods(scores, "reference", num_resamples=100)[0]
+        >>> entry["method"], round(entry["realism_difference"], 3), entry["over"]
+        ('DPA-OMF', 0.1, 'seeds and scenes')
+    """
+    if reference not in per_scene:
+        raise ValueError(f"no method {reference!r} to compare with; per_scene has {sorted(per_scene)}.")
+    base, entries = per_scene[reference], []
+    for method, runs in per_scene.items():
+        if method == reference:
+            continue
+        if len(base) > 1 and not set(runs) <= set(base):
+            raise ValueError(
+                f"{method}: seeds {sorted(set(runs) - set(base))} have no run of {reference!r} to be paired with; it "
+                f"has {sorted(base)}. Give it one run for all, or the same seeds."
+            )
+        paired = [base[run] for run in runs] if len(base) > 1 else list(base.values())
+        try:
+            found = paired_bootstrap(_rows(runs.values()), _rows(paired), num_resamples, seed=seed)
+        except ValueError as error:
+            raise ValueError(f"{method} against {reference}: {error}") from error
+        entries.append(
+            {
+                "method": method,
+                "realism_difference": found.mean,
+                "ci95": [found.low, found.high],
+                "over": found.over,
+                "n_seeds": found.num_seeds,
+            }
+        )
+    return entries
+
+
+def _rows(runs: Sequence[Sequence[float]]) -> NDArray[np.float64]:
+    lengths = [len(run) for run in runs]
+    if len(set(lengths)) > 1:
+        raise ValueError(f"the seeds have different numbers of scenes, {lengths}.")
+    return np.array([list(run) for run in runs], dtype=np.float64)
+
+
+def _checked(values: ArrayLike, name: str) -> NDArray[np.float64]:
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim != 2 or 0 in array.shape:
+        raise ValueError(f"{name} must be [seeds, scenes] with at least one of each, got shape {list(array.shape)}.")
+    if not np.isfinite(array).all():
+        row, column = np.argwhere(~np.isfinite(array))[0]
+        raise ValueError(
+            f"{name}: row (seed) {row}, column (scene) {column} is {array[row, column]}; a scene without a score "
+            "must be left out of all methods."
+        )
+    return array
+
+
+def _bootstrap(values: NDArray[np.float64], num_resamples: int, seed: int) -> Interval:
+    """Resampled means as products of counts: drawing rows and columns is the same as weighting them."""
+    if num_resamples < 1:
+        raise ValueError(f"num_resamples must be at least 1, got {num_resamples}.")
+    num_seeds, num_scenes = values.shape
+    rng, means = np.random.default_rng(seed), []
+    chunk = max(1, _COUNTS_AT_ONCE // num_scenes)
+    for done in range(0, num_resamples, chunk):
+        draws = min(chunk, num_resamples - done)
+        scenes = rng.multinomial(num_scenes, np.full(num_scenes, 1 / num_scenes), size=draws)
+        seeds = rng.multinomial(num_seeds, np.full(num_seeds, 1 / num_seeds), size=draws)
+        means.append(np.einsum("rk,kn,rn->r", seeds, values, scenes, optimize=True) / values.size)
+    low, high = np.quantile(np.concatenate(means), [0.025, 0.975])
+    over = SCENES if num_seeds == 1 else SEEDS_AND_SCENES
+    return Interval(float(values.mean()), float(low), float(high), over, num_seeds, num_scenes)

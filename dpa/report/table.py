@@ -1,0 +1,215 @@
+"""The results table: METHOD's table 1, safety rates and the paired difference, for a terminal, a document or a page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.segment import Segments
+from rich.table import Table
+
+REFERENCE = "reference"
+"""Method name of the model before alignment."""
+MISSING = "\N{EN DASH}"
+"""Stands for a number that was not measured."""
+MINUS = "\N{MINUS SIGN}"
+
+
+class Column(NamedTuple):
+    """A measure of a row.
+
+    Attributes:
+        key: in a row of the comparison.
+        title: of the column.
+        digits: after the point.
+        better: an arrow up or down: where better values lie.
+    """
+
+    key: str
+    title: str
+    digits: int
+    better: str
+
+
+COLUMNS = (
+    Column("kinematic", "kinematic", 3, "↑"),
+    Column("interactive", "interactive", 3, "↑"),
+    Column("map_based", "map", 3, "↑"),
+    Column("realism", "realism", 3, "↑"),
+    Column("min_ade", "minADE", 3, "↓"),
+    Column("collision_rate", "collision", 3, "↓"),
+    Column("offroad_rate", "off-road", 3, "↓"),
+    Column("preference_distance", "distance", 2, "↓"),
+    Column("pair_accuracy", "pair acc.", 3, "↑"),
+)
+"""Measures in the order of METHOD table 1, then safety, then the preference distance and table 3's accuracy."""
+
+DIFFERENCE_TITLE = "Δ realism [95 %]"
+
+
+def summarise(rows: Sequence[dict[str, Any]], paired: Sequence[dict[str, Any]] = ()) -> list[dict[str, Any]]:
+    """One record for each method and top-p: means over seeds, with the paired difference beside them.
+
+    Args:
+        rows: the comparison's rows; a measure may be None or absent, ``top_p`` and ``seed`` too.
+        paired: the comparison's paired differences; an entry with a ``top_p`` belongs to that one only.
+
+    Returns:
+        Records ``{"method", "top_p", "n_seeds", "n_scenes", <every COLUMNS key>, "realism_difference", "ci95"}`` in the
+        order of first appearance. A mean over seeds of which one has no value is None.
+
+    Raises:
+        ValueError: a NaN, or a paired entry that fits no record or several.
+
+    Examples:
+        >>> rows = [{"method": "reference", "seed": seed, "realism": 0.70 + 0.02 * seed} for seed in range(2)]
+        >>> record = summarise(rows)[0]
+        >>> round(record["realism"], 3), record["n_seeds"], record["pair_accuracy"]
+        (0.71, 2, None)
+    """
+    groups: dict[tuple[str, float | None], list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault((row["method"], row.get("top_p")), []).append(row)
+    records = []
+    for (method, top_p), members in groups.items():
+        record = {"method": method, "top_p": top_p, "n_seeds": len(members), "n_scenes": members[0].get("n_scenes")}
+        record |= {
+            column.key: _mean([row.get(column.key) for row in members], method, column.key) for column in COLUMNS
+        }
+        records.append(record | {"realism_difference": None, "ci95": None})
+    for entry in paired:
+        record = _owner(entry, records)
+        record["realism_difference"], record["ci95"] = entry["realism_difference"], list(entry["ci95"])
+    return records
+
+
+def header(records: Sequence[dict[str, Any]]) -> list[str]:
+    """Titles of the columns that :func:`cells` fills."""
+    measures = [f"{column.title} {column.better}" for column in COLUMNS]
+    return ["method", *(["top-p"] if _shows_top_p(records) else []), "seeds", *measures, DIFFERENCE_TITLE]
+
+
+def cells(records: Sequence[dict[str, Any]]) -> list[list[str]]:
+    """Records of :func:`summarise` as text, missing values as a dash.
+
+    Examples:
+        >>> cells(summarise([{"method": "reference", "realism": 0.7}]))[0][:6]
+        ['reference', '1', '–', '–', '–', '0.700']
+    """
+    show_top_p = _shows_top_p(records)
+    return [
+        [
+            record["method"],
+            *([number(record["top_p"], 2)] if show_top_p else []),
+            str(record["n_seeds"]),
+            *(number(record[column.key], column.digits) for column in COLUMNS),
+            difference(record["realism_difference"], record["ci95"]),
+        ]
+        for record in records
+    ]
+
+
+def number(value: float | None, digits: int) -> str:
+    """A value with fixed digits, or a dash.
+
+    Examples:
+        >>> number(0.7394, 3), number(None, 3)
+        ('0.739', '–')
+    """
+    return MISSING if value is None else f"{value:.{digits}f}".replace("-", MINUS)
+
+
+def signed(value: float, digits: int = 3) -> str:
+    """A difference with its sign; a value that rounds to zero has none.
+
+    Examples:
+        >>> signed(0.0123), signed(-0.002), signed(-0.0001)
+        ('+0.012', '−0.002', '0.000')
+    """
+    text = f"{value:+.{digits}f}"
+    return text[1:] if float(text) == 0 else text.replace("-", MINUS)
+
+
+def difference(mean: float | None, interval: Sequence[float] | None) -> str:
+    """A paired difference and its interval, or a dash.
+
+    Examples:
+        >>> difference(0.012, [0.003, 0.021])
+        '+0.012 [+0.003, +0.021]'
+    """
+    if mean is None or interval is None:
+        return MISSING
+    return f"{signed(mean)} [{signed(interval[0])}, {signed(interval[1])}]"
+
+
+def to_rich(
+    rows: Sequence[dict[str, Any]], paired: Sequence[dict[str, Any]] = (), *, title: str | None = None
+) -> Table:
+    """The table for a terminal; the arguments are those of :func:`summarise`."""
+    records = summarise(rows, paired)
+    table = Table(title=title, title_justify="left", header_style="bold", box=SIMPLE_HEAD, padding=(0, 1))
+    for name in header(records):
+        table.add_column(name, justify="left" if name == "method" else "right", no_wrap=True)
+    for row in cells(records):
+        table.add_row(*row)
+    return table
+
+
+def print_table(
+    rows: Sequence[dict[str, Any]],
+    paired: Sequence[dict[str, Any]] = (),
+    *,
+    title: str | None = None,
+    console: Console | None = None,
+) -> None:
+    """Print the table.
+
+    Args:
+        rows: see :func:`summarise`.
+        paired: see :func:`summarise`.
+        title: above the table.
+        console: where to print; standard output by default.
+    """
+    console = console or Console()
+    table = to_rich(rows, paired, title=title)
+    # Numbers folded over two lines are misread; a narrow terminal wraps or scrolls whole lines instead.
+    options = console.options.update(width=1_000)
+    options = options.update(width=console.measure(table, options=options).maximum)
+    console.print(Segments(console.render(table, options)), crop=False, soft_wrap=True, end="")
+
+
+def to_markdown(rows: Sequence[dict[str, Any]], paired: Sequence[dict[str, Any]] = ()) -> str:
+    """The table in GitHub's Markdown; the arguments are those of :func:`summarise`.
+
+    Examples:
+        >>> print(to_markdown([{"method": "reference", "realism": 0.7}]).splitlines()[2][:36])
+        | reference | 1 | – | – | – | 0.700
+    """
+    records = summarise(rows, paired)
+    titles = header(records)
+    lines = [titles, ["---" if title == "method" else "---:" for title in titles], *cells(records)]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines) + "\n"
+
+
+def _shows_top_p(records: Sequence[dict[str, Any]]) -> bool:
+    return any(record["top_p"] is not None for record in records)
+
+
+def _mean(values: list[float | None], method: str, key: str) -> float | None:
+    if any(value is not None and math.isnan(value) for value in values):
+        raise ValueError(f"{method}: {key} is NaN in one of its rows; write None where nothing was measured.")
+    # A mean over some of the seeds would stand beside means over all of them.
+    return None if any(value is None for value in values) else math.fsum(values) / len(values)
+
+
+def _owner(entry: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, Any]:
+    found = [r for r in records if r["method"] == entry["method"] and entry.get("top_p", r["top_p"]) == r["top_p"]]
+    if len(found) != 1:
+        raise ValueError(
+            f"the paired difference of {entry['method']!r} (top_p {entry.get('top_p')}) fits {len(found)} of the "
+            "table's rows; it must name the method, and the top_p where the method has several."
+        )
+    return found[0]

@@ -1,0 +1,112 @@
+"""Training items and batches: pure functions of (seed, step), so that a resumed run sees what it would have seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torch.nn import functional as F
+
+from dpa.policy.context import SceneContext, collate_contexts, keep_agents
+from dpa.tokens.base import MotionTokenizer
+from dpa.training.seeding import make_generator
+from envs import keys
+
+
+class Item(NamedTuple):
+    """Tokens of some rollouts (or of the log) of one scene.
+
+    Attributes:
+        context: uncollated.
+        tokens: ``[M, A, T]`` int64.
+        token_valid: ``[A, T]`` bool.
+    """
+
+    context: SceneContext
+    tokens: Tensor
+    token_valid: Tensor
+
+
+def log_item(context: SceneContext, tokenizer: MotionTokenizer) -> Item:
+    """The log of a scene as one rollout (M = 1): what pre-training learns from (eq. 1).
+
+    Examples:
+        >>> from dpa.policy import make_context
+        >>> from dpa.tokens import VerletTokenizer
+        >>> from envs.sources.synthetic import straight_road
+        >>> log_item(make_context(straight_road(2)), VerletTokenizer()).tokens.shape
+        torch.Size([1, 2, 16])
+    """
+    tracks = tokenizer.encode_tracks(context.logged, context.logged_valid, context.recent, context.kind)
+    return Item(context, tracks.tokens[None], tracks.valid & context.controlled[:, None])
+
+
+def crop_agents(item: Item, limit: int, generator: torch.Generator) -> Item:
+    """Keep the ``limit`` agents nearest to a random one, to bound the cost of a crowded scene."""
+    count = len(item.context.kind)
+    if count <= limit:
+        return item
+    xy = item.context.recent[:, -1, :2]
+    centre = xy[torch.randint(count, (), generator=generator)]
+    near = (xy - centre).norm(dim=-1).argsort(stable=True)[:limit].sort().values
+    return Item(keep_agents(item.context, near), item.tokens[:, near], item.token_valid[near])
+
+
+def collate_items(items: Sequence[Item]) -> TensorDict:
+    """A batch for a loss: ``context``, ``tokens`` ``[S, M, A, T]`` and ``token_valid`` ``[S, 1, A, T]``.
+
+    Args:
+        items: S items of equal M and T.
+    """
+    agents = max(item.tokens.shape[1] for item in items)
+
+    def pad(value: Tensor) -> Tensor:
+        return F.pad(value, (0, 0, 0, agents - value.shape[-2]))
+
+    return TensorDict(
+        {
+            "context": collate_contexts([item.context for item in items]),
+            keys.TOKENS: torch.stack([pad(item.tokens) for item in items]),
+            keys.TOKEN_VALID: torch.stack([pad(item.token_valid) for item in items])[:, None],
+        },
+        batch_size=[len(items)],
+    )
+
+
+class ShuffledOrder:
+    """Which items a step takes: a new permutation every epoch, decided by the seed alone.
+
+    Args:
+        num_items: items of the data set.
+        batch_size: items of a step; it may exceed ``num_items``.
+        seed: of the permutations.
+
+    Raises:
+        ValueError: nothing to draw from.
+
+    Examples:
+        >>> order = ShuffledOrder(4, batch_size=2, seed=0)
+        >>> sorted(order(0) + order(1))
+        [0, 1, 2, 3]
+    """
+
+    def __init__(self, num_items: int, batch_size: int, seed: int) -> None:
+        if num_items < 1 or batch_size < 1:
+            raise ValueError(f"num_items and batch_size must be positive, got {num_items} and {batch_size}.")
+        self.num_items, self.batch_size, self.seed = num_items, batch_size, seed
+        self._epoch, self._order = -1, []
+
+    def __call__(self, step: int) -> list[int]:
+        """Indices of the items of one step."""
+        first = step * self.batch_size
+        return [self._item(position) for position in range(first, first + self.batch_size)]
+
+    def _item(self, position: int) -> int:
+        epoch, offset = divmod(position, self.num_items)
+        if epoch != self._epoch:
+            generator = make_generator(self.seed, "epoch", epoch)
+            self._epoch, self._order = epoch, torch.randperm(self.num_items, generator=generator).tolist()
+        return self._order[offset]

@@ -1,0 +1,139 @@
+"""Optimiser, learning-rate schedule and the step that guards against gradients that are not finite."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import nn
+from torch.optim import AdamW, Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+
+EMBEDDINGS = (nn.Embedding, nn.EmbeddingBag)
+BETAS = (0.9, 0.95)
+"""Decay rates of AdamW's moments; 0.95 is usual for transformers, whose gradients have heavy tails."""
+
+
+def make_optimizer(module: nn.Module, lr: float, weight_decay: float, betas: tuple[float, float] = BETAS) -> AdamW:
+    """AdamW whose weight decay spares norms, biases and embeddings.
+
+    Decay pulls towards zero. That regularises the matrices of linear maps, but it shrinks the scale of a norm and the
+    rows of tokens that a batch does not contain. Parameters of fewer than two dimensions, those of embedding modules,
+    and bare parameters whose name ends in ``embedding`` are not decayed.
+
+    Args:
+        module: whatever holds the parameters to train; those that need no gradient are left out.
+        lr: peak learning rate.
+        weight_decay: decay of the matrices.
+        betas: decay rates of the first and second moment.
+
+    Raises:
+        ValueError: no parameter of ``module`` needs a gradient.
+
+    Examples:
+        >>> net = nn.Sequential(nn.Embedding(7, 4), nn.Linear(4, 4), nn.LayerNorm(4))
+        >>> [(len(g["params"]), g["weight_decay"]) for g in make_optimizer(net, 1e-3, 0.1).param_groups]
+        [(1, 0.1), (4, 0.0)]
+    """
+    embeddings = {id(p) for part in module.modules() if isinstance(part, EMBEDDINGS) for p in part.parameters()}
+    decayed, spared = [], []
+    for name, parameter in module.named_parameters():
+        if not parameter.requires_grad:
+            continue
+        spare = parameter.ndim < 2 or id(parameter) in embeddings or name.endswith("embedding")
+        (spared if spare else decayed).append(parameter)
+    if not decayed and not spared:
+        raise ValueError(f"{type(module).__name__} has no parameter that needs a gradient; unfreeze some of it.")
+    groups = [{"params": decayed, "weight_decay": weight_decay}, {"params": spared, "weight_decay": 0.0}]
+    return AdamW([group for group in groups if group["params"]], lr=lr, betas=betas)
+
+
+def make_schedule(
+    optimizer: Optimizer, total_steps: int, warmup_steps: int = 0, shape: Literal["linear", "cosine"] = "cosine"
+) -> LambdaLR:
+    """Linear warm-up to the optimiser's learning rate, then linear or cosine decay to 0 at ``total_steps``.
+
+    Args:
+        optimizer: its ``lr`` is the peak.
+        total_steps: updates of the whole run.
+        warmup_steps: updates of the warm-up; the last of them is taken at the peak.
+        shape: how the rate falls.
+
+    Returns:
+        A scheduler to step once per update (:func:`clip_and_step` does).
+
+    Raises:
+        ValueError: an unknown shape, or a warm-up that does not end within the run.
+
+    Examples:
+        >>> optimizer = make_optimizer(nn.Linear(2, 2), lr=1.0, weight_decay=0.0)
+        >>> schedule = make_schedule(optimizer, total_steps=6, warmup_steps=2, shape="linear")
+        >>> rates = []
+        >>> for _ in range(6):
+        ...     rates.append(schedule.get_last_lr()[0])
+        ...     _ = clip_and_step(optimizer, max_norm=1.0, schedule=schedule)
+        >>> rates
+        [0.5, 1.0, 1.0, 0.75, 0.5, 0.25]
+    """
+    if shape not in ("linear", "cosine"):
+        raise ValueError(f"shape must be 'linear' or 'cosine', got {shape!r}.")
+    if not 0 <= warmup_steps < total_steps:
+        raise ValueError(
+            f"warmup_steps must lie in [0, total_steps), got {warmup_steps} of {total_steps}. Shorten the warm-up."
+        )
+
+    def factor(step: int) -> float:
+        if step < warmup_steps:
+            return (step + 1) / warmup_steps
+        left = max(0.0, (total_steps - step) / (total_steps - warmup_steps))
+        return left if shape == "linear" else 0.5 * (1 - math.cos(math.pi * left))
+
+    return LambdaLR(optimizer, factor)
+
+
+def clip_and_step(
+    optimizer: Optimizer,
+    max_norm: float,
+    schedule: LambdaLR | None = None,
+    on_nonfinite: Literal["raise", "skip"] = "raise",
+) -> float:
+    """Clip the gradients, update the parameters, advance the schedule and clear the gradients.
+
+    A skipped update leaves the schedule where it is: the schedule counts the updates that were made.
+
+    Args:
+        optimizer: holds the parameters.
+        max_norm: bound on the norm of all gradients together.
+        schedule: what :func:`make_schedule` returned.
+        on_nonfinite: what to do when the norm is infinite or not a number: stop, or leave the parameters as they are.
+
+    Returns:
+        The norm before clipping; not finite if the update was skipped.
+
+    Raises:
+        FloatingPointError: the norm is not finite and ``on_nonfinite`` is ``"raise"``; the parameters are unchanged.
+        ValueError: another ``on_nonfinite``.
+
+    Examples:
+        >>> net = nn.Linear(1, 1, bias=False)
+        >>> optimizer = make_optimizer(net, lr=0.1, weight_decay=0.0)
+        >>> (3 * net.weight).sum().backward()
+        >>> clip_and_step(optimizer, max_norm=1.0)
+        3.0
+    """
+    if on_nonfinite not in ("raise", "skip"):
+        raise ValueError(f"on_nonfinite must be 'raise' or 'skip', got {on_nonfinite!r}.")
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    norm = torch.nn.utils.clip_grad_norm_(parameters, max_norm).item()
+    if math.isfinite(norm):
+        optimizer.step()
+        if schedule is not None:
+            schedule.step()
+    elif on_nonfinite == "raise":
+        raise FloatingPointError(
+            f"the gradient norm is {norm}; the parameters are unchanged. Lower the learning rate, look for an input "
+            "that is not finite, or pass on_nonfinite='skip'."
+        )
+    optimizer.zero_grad(set_to_none=True)
+    return norm

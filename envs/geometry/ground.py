@@ -1,0 +1,108 @@
+"""Height of the road under moving agents, for policies that predict ``(x, y, heading)`` only."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+LEVEL_STRETCH = 3.0
+"""Weight of height in "nearest", so that a bridge is far from the road below it (SPEC section 4.1)."""
+KNOT_STEPS = 5
+"""Steps of 0.1 s between two looks at the map; heights between them are interpolated."""
+
+
+class Ground:
+    """Heights of a map's points, asked for by place and level.
+
+    Args:
+        points: ``[N, 3]`` map points [m].
+
+    Raises:
+        ValueError: there is no point.
+
+    Examples:
+        >>> ground = Ground(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 8.0], [5.0, 0.0, 2.0]]))
+        >>> ground.height(torch.tensor([[0.5, 0.0], [0.5, 0.0]]), level=torch.tensor([0.0, 9.0]))
+        tensor([1., 8.])
+    """
+
+    def __init__(self, points: Tensor) -> None:
+        if len(points) == 0:
+            raise ValueError("the map has no point, so the ground has no height; give the scene a road edge.")
+        points = points.detach().cpu().numpy()
+        self._height = points[:, 2].astype(np.float32)
+        self._tree = cKDTree(points * (1.0, 1.0, LEVEL_STRETCH))
+
+    def height(self, xy: Tensor, level: Tensor) -> Tensor:
+        """Height of the nearest map point on the level given.
+
+        Args:
+            xy: ``[..., 2]`` [m].
+            level: ``[...]`` height near which the point should lie [m].
+
+        Returns:
+            ``[...]`` [m].
+        """
+        query = torch.cat((xy, LEVEL_STRETCH * level[..., None]), -1).detach().cpu().numpy()
+        _, nearest = self._tree.query(query)
+        return torch.from_numpy(self._height[nearest]).to(xy.device)
+
+
+def lift(poses: Tensor, start: Tensor, points: Tensor) -> Tensor:
+    """Give rollouts the height of the road: ``z(t) = z(current) + h(xy_t) - h(xy_current)``.
+
+    h is looked up every 0.5 s on the level of the last look-up, so that an agent follows a ramp and does not jump to
+    the bridge above it; between look-ups it is interpolated.
+
+    Args:
+        poses: ``[R, A, T, 3]`` x, y, heading at 10 Hz from the step after the current one on.
+        start: ``[A, 3]`` x, y, z at the current step, of the agents' centres [m].
+        points: ``[N, 3]`` map points [m].
+
+    Returns:
+        ``[R, A, T, 4]`` x, y, z, heading.
+
+    Raises:
+        ValueError: another number of agents, or a pose that is not finite.
+
+    Examples:
+        >>> kerb = torch.tensor([[x, 0.0, float(x > 5)] for x in range(20)])
+        >>> poses = torch.arange(1.0, 11.0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
+        >>> lift(poses[None, None], torch.tensor([[0.0, 0.0, 0.75]]), kerb)[0, 0, -1]
+        tensor([10.0000,  0.0000,  1.7500,  0.0000])
+    """
+    if poses.shape[1] != len(start):
+        raise ValueError(
+            f"poses of {poses.shape[1]} agents do not fit the starts of {len(start)}; give the same agents."
+        )
+    if not torch.isfinite(poses).all():
+        agent = int((~torch.isfinite(poses)).any(-1).any(-1).any(0).nonzero()[0])
+        raise ValueError(f"a pose of agent {agent} is not finite, so it has no height; mend the rollout.")
+    ground = Ground(points)
+    start = start.to(poses)
+    first = ground.height(start[:, :2], start[:, 2]).expand(poses.shape[:2])
+    above = start[:, 2] - first  # kept in every look-up, so that an agent that stands finds the same point again
+
+    knots = _knots(poses.shape[2])
+    heights = [first]
+    for knot in knots[1:]:
+        heights.append(ground.height(poses[:, :, knot - 1, :2], heights[-1] + above))
+    rise = _interpolate(knots, torch.stack(heights, -1) - first[..., None])
+    return torch.cat((poses[..., :2], (start[:, 2, None] + rise)[..., None], poses[..., 2:]), -1)
+
+
+def _knots(steps: int) -> list[int]:
+    """Steps at which the map is looked at: the current one (0), every :data:`KNOT_STEPS`-th, the last one."""
+    return [*range(0, steps, KNOT_STEPS), steps]
+
+
+def _interpolate(knots: list[int], values: Tensor) -> Tensor:
+    """Values ``[..., len(knots)]`` at the knots -> ``[..., knots[-1]]`` at the steps 1, 2, ..., knots[-1]."""
+    places = torch.tensor(knots, device=values.device)
+    steps = torch.arange(1, knots[-1] + 1, device=values.device)
+    right = torch.searchsorted(places, steps)
+    left = right - 1
+    part = ((steps - places[left]) / (places[right] - places[left])).to(values)
+    return torch.lerp(values[..., left], values[..., right], part)

@@ -1,0 +1,200 @@
+"""Whole pictures: a scene on axes, frames of an animation, PNG and GIF files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+
+from envs.render.layers import View, draw_agents, draw_map, draw_trails, fit_view, frame_view, pose_tracks
+from envs.render.style import AGENT_COLORS, INK_COLOR, SDC_COLOR
+from envs.scene import CURRENT_STEP, LOG_STEPS, STEP_SECONDS, AgentKind, Scene
+
+
+def draw_scene(
+    axes: Axes,
+    scene: Scene,
+    trajectories: Tensor | None = None,
+    *,
+    step: int = CURRENT_STEP,
+    view: View | None = None,
+    trails: bool = True,
+    legend: bool = True,
+) -> None:
+    """Draw one scene at one step: map, lights, agents, the paths behind them (thin) and ahead of them (fading).
+
+    Args:
+        axes: where to draw; its limits, aspect and ticks are set.
+        scene: one uncollated scene.
+        trajectories: ``[A', T, 3 or 4]``, see :func:`pose_tracks`; the log by default.
+        step: 0 to 90; 10 is the current step.
+        view: window; :func:`fit_view` by default.
+        trails: draw the paths.
+        legend: draw colours, a scale and the time.
+
+    Raises:
+        ValueError: a step outside the scene, or trajectories that do not fit it.
+
+    Examples:
+        >>> from envs.sources.synthetic import straight_road
+        >>> axes = Figure().subplots()
+        >>> draw_scene(axes, straight_road(num_vehicles=3), step=40)
+        >>> [round(float(x)) for x in axes.get_xlim()]
+        [-55, 95]
+    """
+    tracks = pose_tracks(scene, trajectories)
+    frame_view(axes, view or fit_view(scene))
+    draw_map(axes, scene)
+    if legend:
+        _draw_legend(axes, scene)
+    _draw_moment(axes, scene, tracks, step, trails=trails, clock=legend)
+
+
+def render_frames(
+    scene: Scene,
+    trajectories: Tensor | None = None,
+    *,
+    steps: Iterable[int] = range(LOG_STEPS),
+    view: View | None = None,
+    trails: bool = True,
+    pixels: int = 900,
+) -> Iterator[NDArray[np.uint8]]:
+    """Render one picture for each step; the map is drawn only once.
+
+    Args:
+        scene: one uncollated scene.
+        trajectories: ``[A', T, 3 or 4]``, see :func:`pose_tracks`; the log by default.
+        steps: steps to render, each 0 to 90.
+        view: window, the same for all pictures; :func:`fit_view` by default.
+        trails: draw the paths.
+        pixels: H and W of a picture.
+
+    Yields:
+        ``[H, W, 3]`` uint8.
+
+    Examples:
+        >>> from envs.sources.synthetic import straight_road
+        >>> [frame.shape for frame in render_frames(straight_road(), steps=[10, 50], pixels=200)]
+        [(200, 200, 3), (200, 200, 3)]
+    """
+    tracks = pose_tracks(scene, trajectories)
+    # Line widths and letters are in points: a constant size in inches makes every resolution the same picture.
+    figure = Figure(figsize=(6, 6), dpi=pixels / 6)
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_axes((0, 0, 1, 1))
+    frame_view(axes, view or fit_view(scene))
+    draw_map(axes, scene)
+    _draw_legend(axes, scene)
+    canvas.draw()
+    background = canvas.copy_from_bbox(figure.bbox)
+    for step in steps:
+        canvas.restore_region(background)
+        for artist in sorted(
+            _draw_moment(axes, scene, tracks, step, trails=trails, clock=True), key=lambda a: a.get_zorder()
+        ):
+            axes.draw_artist(artist)
+            artist.remove()
+        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def render_frame(
+    scene: Scene,
+    trajectories: Tensor | None = None,
+    *,
+    step: int = CURRENT_STEP,
+    view: View | None = None,
+    trails: bool = True,
+    pixels: int = 900,
+) -> NDArray[np.uint8]:
+    """Render one step; the arguments are those of :func:`render_frames`.
+
+    Returns:
+        ``[H, W, 3]`` uint8.
+
+    Examples:
+        >>> from envs.sources.synthetic import straight_road
+        >>> render_frame(straight_road(), pixels=300).shape
+        (300, 300, 3)
+    """
+    return next(render_frames(scene, trajectories, steps=[step], view=view, trails=trails, pixels=pixels))
+
+
+def save_picture(path: str | Path, frames: Iterable[NDArray[np.uint8]], *, frame_seconds: float = STEP_SECONDS) -> None:
+    """Write one frame as PNG, or many as a GIF that loops; the file appears whole or not at all.
+
+    Args:
+        path: ends in ``.png`` or ``.gif``.
+        frames: ``[H, W, 3]`` uint8 each; exactly one for a PNG.
+        frame_seconds: how long a GIF shows a frame [s].
+
+    Raises:
+        ValueError: another ending, or a PNG of several frames.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in (".png", ".gif"):
+        raise ValueError(f"a picture must end in .png or .gif, got {path}.")
+    images = [Image.fromarray(frame) for frame in frames]
+    if not images or (suffix == ".png" and len(images) > 1):
+        raise ValueError(f"{path}: {len(images)} frames; a PNG holds exactly one, a GIF one or more.")
+    part = path.with_name(path.name + ".part")
+    if suffix == ".png":
+        images[0].save(part, format="PNG", optimize=True)
+    else:
+        # One palette for all frames: a palette of its own for each one makes the still map flicker.
+        palette = images[len(images) // 2].quantize(128, dither=Image.Dither.NONE)
+        still = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+        duration = round(frame_seconds * 1000)
+        still[0].save(part, format="GIF", save_all=True, append_images=still[1:], duration=duration, loop=0)
+    os.replace(part, path)
+
+
+def _draw_moment(axes: Axes, scene: Scene, tracks: Tensor, step: int, *, trails: bool, clock: bool) -> list[Artist]:
+    """Everything that moves; the artists are returned so that an animation can take them away again."""
+    if not 0 <= step < LOG_STEPS:
+        raise ValueError(f"step must be 0 to {LOG_STEPS - 1}, got {step}.")
+    artists: list[Artist] = []
+    if trails:
+        artists += draw_trails(axes, scene, tracks, 0, step, alpha=0.35, width=0.8)
+        artists += draw_trails(axes, scene, tracks, step, LOG_STEPS - 1)
+    artists += draw_agents(axes, scene, tracks, step)
+    if clock:
+        text = f"{(step - CURRENT_STEP) * STEP_SECONDS:+.1f} s"
+        artists.append(axes.text(0.985, 0.975, text, transform=axes.transAxes, ha="right", va="top", **_LETTERS))
+    return artists
+
+
+_LETTERS = {
+    "fontsize": 9,
+    "color": INK_COLOR,
+    "zorder": 12,
+    "bbox": {"boxstyle": "round,pad=0.35", "facecolor": (1, 1, 1, 0.85), "edgecolor": "none"},
+}
+
+
+def _draw_legend(axes: Axes, scene: Scene) -> None:
+    """Classes that the scene has, and a bar of 20 m (on the ground, so that it is right in any window)."""
+    kinds = set(scene.agents.kind[~scene.agents.sdc].tolist())
+    entries = [("SDC", SDC_COLOR)] + [(AgentKind(k).name.capitalize(), AGENT_COLORS[k]) for k in sorted(kinds)]
+    handles = [Line2D([], [], marker="s", ls="", ms=6, mec="white", mfc=color, label=name) for name, color in entries]
+    legend = axes.legend(
+        handles=handles, loc="upper left", fontsize=8, labelcolor=INK_COLOR, frameon=True, facecolor="white",
+        edgecolor="none", framealpha=0.85, handletextpad=0.2, borderpad=0.5, borderaxespad=0.6, labelspacing=0.35,
+    )  # fmt: skip
+    legend.set_zorder(12)
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    x, y, bar = left + 0.03 * (right - left), low + 0.03 * (high - low), 20.0
+    axes.plot([x, x + bar], [y, y], color=INK_COLOR, lw=1.6, solid_capstyle="butt", zorder=12)
+    axes.text(
+        x + bar / 2, y + 0.008 * (high - low), "20 m", ha="center", va="bottom", fontsize=8, color=INK_COLOR, zorder=12
+    )

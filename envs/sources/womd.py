@@ -1,0 +1,186 @@
+"""Waymo Open Motion Dataset: Scenario protos in TFRecord files -> scenes.
+
+A file is a TFRecord (plain or gzip), or one serialized Scenario where its name ends in ``.binproto`` or ``.pb``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from google.protobuf.message import DecodeError
+
+from envs.scene import CURRENT_STEP, LOG_STEPS, LinkKind, MapKind, Scene, SceneError
+from envs.sources.recording import LightListing, Polyline, Recording
+from envs.sources.scenario import Scenario
+from envs.sources.source import Source, Unit, find_files
+from envs.sources.tfrecord import offsets, open_binary, read_frame
+
+METRES_PER_SECOND_PER_MPH = 0.44704
+_BARE_SUFFIXES = (".binproto", ".pb")
+_INVALID_STATE = (0.0,) * 9
+# Enum of the map feature plus this is its MapKind; the enums of WOMD each count from 0.
+_LINE_OFFSET, _EDGE_OFFSET = int(MapKind.LINE_UNKNOWN), int(MapKind.EDGE_UNKNOWN)
+_POLYGONS = {"crosswalk": MapKind.CROSSWALK, "speed_bump": MapKind.SPEED_BUMP, "driveway": MapKind.DRIVEWAY}
+
+
+def read_womd(path: str | Path) -> Iterator[Scene]:
+    """Scenes of one WOMD file, in file order, each validated.
+
+    Args:
+        path: a TFRecord of Scenario protos, or one bare Scenario (``.binproto``, ``.pb``).
+
+    Raises:
+        SceneError: naming the file and the record: broken frame or checksum, no Scenario, not
+            91 steps (the test split holds 11), no SDC, and all that :meth:`~envs.scene.Scene.validate` refuses.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> from envs.sources.scenario import Scenario
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "empty.binproto"
+        ...     size = path.write_bytes(Scenario(scenario_id="none").SerializeToString())
+        ...     next(read_womd(path))
+        Traceback (most recent call last):
+        ...
+        envs.scene.SceneError: ...empty.binproto, record 0 (scene none): it has no tracks; ...
+    """
+    return WOMD.scenes(str(path))
+
+
+def scene_from_scenario(scenario: Any, name: str) -> Scene:
+    """One parsed Scenario -> scene.
+
+    Args:
+        scenario: a message of :data:`~envs.sources.scenario.Scenario`, or of the official class.
+        name: what errors call it.
+    """
+    name = f"{name} (scene {scenario.scenario_id})"
+    _check_steps(scenario, name)
+    states = np.array([[_state(state) for state in track.states] for track in scenario.tracks], dtype=np.float64)
+    features = scenario.map_features
+    return Recording(
+        scene_id=scenario.scenario_id,
+        position=states[..., :3],
+        extent=states[..., 3:6],
+        heading=states[..., 6],
+        velocity=states[..., 7:9],
+        valid=np.array([[state.valid for state in track.states] for track in scenario.tracks]),
+        kind=[track.object_type for track in scenario.tracks],
+        track_id=[track.id for track in scenario.tracks],
+        sdc=scenario.sdc_track_index if scenario.HasField("sdc_track_index") else -1,
+        predict=[required.track_index for required in scenario.tracks_to_predict],
+        polylines=[_polyline(feature, name) for feature in features],
+        links=[link for feature in features if feature.HasField("lane") for link in _links(feature.id, feature.lane)],
+        lights=_lights(scenario),
+    ).to_scene(name)
+
+
+def _check_steps(scenario: Any, name: str) -> None:
+    if not scenario.tracks:
+        raise SceneError(f"{name}: it has no tracks; leave the scene out.")
+    for track in scenario.tracks:
+        if len(track.states) != LOG_STEPS:
+            raise SceneError(
+                f"{name}: track {track.id} has {len(track.states)} steps where {LOG_STEPS} are needed. The test split "
+                "holds the 11 steps of history only: take the training or validation split."
+            )
+    if scenario.current_time_index != CURRENT_STEP:
+        raise SceneError(f"{name}: the current step is {scenario.current_time_index}; it must be {CURRENT_STEP}.")
+    if len(scenario.dynamic_map_states) not in (0, LOG_STEPS):
+        raise SceneError(
+            f"{name}: {len(scenario.dynamic_map_states)} steps of traffic lights; there must be {LOG_STEPS} or none."
+        )
+
+
+def _state(state: Any) -> tuple[float, ...]:
+    """Position (3), size (3), heading and velocity (2) of one state."""
+    if not state.valid:
+        return _INVALID_STATE
+    return (
+        state.center_x,
+        state.center_y,
+        state.center_z,
+        state.length,
+        state.width,
+        state.height,
+        state.heading,
+        state.velocity_x,
+        state.velocity_y,
+    )
+
+
+def _polyline(feature: Any, name: str) -> Polyline:
+    make = partial(Polyline, feature.id)
+    if feature.HasField("lane"):
+        lane = feature.lane
+        return make(lane.type, _xyz(lane.polyline), lane.speed_limit_mph * METRES_PER_SECOND_PER_MPH)
+    if feature.HasField("road_line"):
+        return make(feature.road_line.type + _LINE_OFFSET, _xyz(feature.road_line.polyline))
+    if feature.HasField("road_edge"):
+        return make(feature.road_edge.type + _EDGE_OFFSET, _xyz(feature.road_edge.polyline))
+    if feature.HasField("stop_sign"):
+        return make(MapKind.STOP_SIGN, _xyz([feature.stop_sign.position]))
+    for field, kind in _POLYGONS.items():
+        if feature.HasField(field):
+            return make(kind, _xyz(getattr(feature, field).polygon))
+    raise SceneError(f"{name}: map feature {feature.id} is of a kind that is not known here; remove it.")
+
+
+def _xyz(points: Any) -> list[tuple[float, float, float]]:
+    return [(point.x, point.y, point.z) for point in points]
+
+
+def _links(lane_id: int, lane: Any) -> Iterator[tuple[int, int, int]]:
+    yield from ((lane_id, after, LinkKind.EXIT) for after in lane.exit_lanes)
+    yield from ((before, lane_id, LinkKind.EXIT) for before in lane.entry_lanes)
+    yield from ((lane_id, beside.feature_id, LinkKind.LEFT) for beside in lane.left_neighbors)
+    yield from ((lane_id, beside.feature_id, LinkKind.RIGHT) for beside in lane.right_neighbors)
+
+
+def _lights(scenario: Any) -> list[LightListing]:
+    # An unset stop point is (0, 0, 0) of the world: proto2's default, and what the official metric reads.
+    return [
+        LightListing(step, row.lane, row.state, (row.stop_point.x, row.stop_point.y, row.stop_point.z))
+        for step, listed in enumerate(scenario.dynamic_map_states)
+        for row in listed.lane_states
+    ]
+
+
+def _is_bare(path: str) -> bool:
+    return path.removesuffix(".gz").endswith(_BARE_SUFFIXES)
+
+
+def _locate(path: str) -> Iterator[Unit]:
+    where = iter([0]) if _is_bare(path) else offsets(path)
+    return (Unit(path, record, offset) for record, offset in enumerate(where))
+
+
+@contextmanager
+def _open(path: str) -> Iterator[Callable[[Unit], Scene]]:
+    with open_binary(path) as file:
+
+        def make(unit: Unit) -> Scene:
+            payload = file.read() if _is_bare(path) else read_frame(file, unit.key, unit.name)
+            try:
+                scenario = Scenario.FromString(payload)
+            except DecodeError as error:
+                raise SceneError(
+                    f"{unit.name}: not a Scenario proto ({error}); convert WOMD's scenario files."
+                ) from error
+            return scene_from_scenario(scenario, unit.name)
+
+        yield make
+
+
+WOMD = Source(
+    name="womd",
+    help="Waymo Open Motion Dataset: TFRecord files of Scenario protos",
+    find=lambda paths: find_files(paths, "*.tfrecord*", *(f"*{suffix}" for suffix in _BARE_SUFFIXES)),
+    locate=_locate,
+    open=_open,
+)

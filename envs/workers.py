@@ -1,0 +1,99 @@
+"""Run independent tasks, here or in several processes, and hear of each scene as it is made."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any, TypeVar
+
+import torch
+
+from envs.scene import SceneError
+
+Task = TypeVar("Task")
+Work = Callable[[Task, Callable[[int], Any]], None]
+
+_POLL_SECONDS = 0.2
+"""How often the progress of the workers is looked at."""
+
+
+def run_tasks(work: Work, tasks: Sequence[Task], workers: int, tick: Callable[[int], Any]) -> Iterator[Task]:
+    """Do every task and give it back when it is done, in any order.
+
+    After a failure no further task is started; those under way are finished first.
+
+    Args:
+        work: a function that can be imported by name, called with a task and with ``tick``.
+        tasks: what to do.
+        workers: processes; 1 works in this one.
+        tick: called with the number of scenes made since the last call.
+
+    Raises:
+        SceneError: a worker was killed.
+
+    Examples:
+        >>> counted = []
+        >>> done = list(run_tasks(lambda task, tick: tick(task), [1, 2], workers=1, tick=counted.append))
+        >>> done, counted
+        ([1, 2], [1, 2])
+    """
+    if workers > 1:
+        yield from _run_in_pool(work, tasks, workers, tick)
+        return
+    for task in tasks:
+        work(task, tick)
+        yield task
+
+
+def _run_in_pool(work: Work, tasks: Sequence[Task], workers: int, tick: Callable[[int], Any]) -> Iterator[Task]:
+    context = multiprocessing.get_context("spawn")  # a forked process would inherit the threads' locks of torch
+    made = context.Value("q", 0)
+    pool = ProcessPoolExecutor(workers, context, _start_worker, (made,))
+    counted = 0
+    try:
+        waiting = {pool.submit(_work_and_count, work, task): task for task in tasks}
+        while waiting:
+            done, _ = wait(waiting, _POLL_SECONDS, FIRST_COMPLETED)
+            tick(made.value - counted)
+            counted = made.value
+            for future in done:
+                future.result()
+                yield waiting.pop(future)
+    except BrokenProcessPool as error:
+        raise SceneError(
+            "a worker was killed, perhaps for want of memory; run it again with fewer workers or smaller shards."
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+_made: Any = None
+"""In a worker: the counter that it shares with its parent."""
+
+
+def _start_worker(made: Any) -> None:
+    global _made
+    _made = made
+    torch.set_num_threads(1)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """A killed parent cannot tell its workers to stop, and they would wait for tasks for ever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _work_and_count(work: Work, task: Task) -> None:
+    work(task, _count)
+
+
+def _count(scenes: int) -> None:
+    with _made.get_lock():
+        _made.value += scenes

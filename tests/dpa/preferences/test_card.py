@@ -1,0 +1,75 @@
+"""The data card, its annotation time, and the command line that prints it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from scipy.stats import spearmanr
+
+from dpa.preferences import PreferenceStore, PreferenceWriter, data_card
+from dpa.preferences.__main__ import main
+from dpa.preferences.card import annotation_seconds, mean_spearman
+from dpa.preferences.examples import example_groups, example_provenance
+from envs import keys
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A store of three scenes, one of which has all rollouts at one distance."""
+    groups = example_groups(3)
+    groups[keys.DISTANCE][:2] = torch.tensor([[0.0, 1, 2, 3, 4, 5, 6, 7], [7.0, 6, 5, 4, 3, 2, 1, 0]])
+    groups[keys.DISTANCE][2] = 3.0
+    groups[keys.ADE] = torch.arange(8.0).expand(3, 8).clone()
+    with PreferenceWriter(tmp_path, example_provenance()) as writer:
+        writer.append(groups)
+    return tmp_path
+
+
+def test_card_of_a_hand_case(folder: Path) -> None:
+    card = data_card(PreferenceStore(folder))
+    assert (card.scenes, card.rollouts, card.pairs, card.agents) == (3, 8, 2, 2 + 3 + 4)
+    assert card.tied_scenes == 1
+    assert card.tied_pairs == pytest.approx(1 / 3)
+    assert card.margin == pytest.approx((7 + 5 + 7 + 5 + 0 + 0) / 6)
+    assert card.spearman == pytest.approx(0)
+    seconds = 0.7 + 4.2 * torch.tensor([1, 2, 3]).double() / 9
+    assert card.human_hours == pytest.approx(float(seconds.sum()) * 2 / 3600)
+
+
+def test_annotation_time_meets_the_points_of_the_paper_and_stays_beyond_the_last() -> None:
+    agents = torch.tensor([1, 10, 20, 30, 40, 80, 128])
+    assert annotation_seconds(agents).tolist() == pytest.approx([0.7, 4.9, 9.8, 19.6, 29.4, 42.1, 42.1])
+
+
+def test_spearman_equals_scipy_with_ties() -> None:
+    rng = torch.Generator().manual_seed(0)
+    first, second = (torch.randint(0, 5, (6, 10), generator=rng).float() for _ in range(2))
+    want = sum(spearmanr(a, b).statistic for a, b in zip(first, second, strict=True)) / 6
+    assert mean_spearman(first, second) == pytest.approx(want)
+    assert math.isnan(mean_spearman(torch.zeros(1, 4), torch.rand(1, 4)))
+
+
+def test_info_prints_card_and_origin(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(folder), "--pairs", "4"]) == 0
+    printed = capsys.readouterr().out
+    assert "12 (4 per scene" in printed
+    assert '"vocab_size": 169' in printed
+
+
+def test_verify_tells_a_sound_store_from_a_damaged_one(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["verify", str(folder)]) == 0
+    next(folder.glob("chunk-*/ade.npy")).unlink()
+    assert main(["verify", str(folder)]) == 1
+    assert "ade.npy is missing" in capsys.readouterr().out
+
+
+def test_a_wrong_folder_or_too_many_pairs_end_with_one_clear_line(folder: Path, tmp_path: Path, capsys) -> None:
+    assert main(["info", str(tmp_path / "nowhere")]) == 1
+    assert main(["info", str(folder), "--pairs", "5"]) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2
+    assert "no preference store" in lines[0]
+    assert "5 disjoint pairs need 10 rollouts" in lines[1]

@@ -1,0 +1,154 @@
+"""Features of the occupancy measure, on scenes whose values follow by hand."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from dpa.ranking.features import (
+    FEATURES,
+    feature_names,
+    feature_weights,
+    log_trajectory,
+    occupancy_features,
+    register,
+)
+from envs.geometry.boxes import signed_box_distance
+from envs.scene import CURRENT_STEP, MapKind, Scene
+from envs.sources.synthetic import CAR, build_scene, straight_road, two_cars_head_on
+
+TIME = (torch.arange(91) - CURRENT_STEP) * 0.1
+
+
+def of_log(scene: Scene, *names: str, **options) -> tuple[dict[str, Tensor], Tensor]:
+    """Features of the log by name ``[A, T]``, and valid ``[A, T]``."""
+    names = names or feature_names("full")
+    phi, valid = occupancy_features(scene, log_trajectory(scene, 80)[None], names, **options)
+    return dict(zip(names, phi[0].unbind(-1), strict=True)), valid
+
+
+def circling(speed: float = 8.0, radius: float = 20.0) -> Scene:
+    """One car on a circle: speed and effort v^2 / r are constant."""
+    angle = speed / radius * TIME
+    poses = torch.stack((radius * angle.sin(), radius * (1 - angle.cos()), angle), -1)[None]
+    edge = torch.tensor([[-100.0, -50.0], [100.0, -50.0]])
+    return build_scene(poses, [(MapKind.EDGE_BOUNDARY, edge)])
+
+
+def test_speed_and_effort_of_a_circle_follow_from_its_radius() -> None:
+    phi, valid = of_log(circling())
+    assert valid.all()
+    torch.testing.assert_close(phi["speed"], torch.full((1, 80), 8.0), atol=0.02, rtol=0)
+    torch.testing.assert_close(phi["effort"], torch.full((1, 80), 8.0**2 / 20), atol=0.02, rtol=0)
+
+
+def test_clearance_and_collision_are_those_of_the_rounded_boxes() -> None:
+    scene = two_cars_head_on()
+    phi, _ = of_log(scene)
+    extent = torch.tensor(CAR[:2])
+    boxes = [torch.cat((pose[:, [0, 1, 3]], extent.expand(80, 2)), -1) for pose in log_trajectory(scene, 80)]
+    want = signed_box_distance(*boxes).clamp(-5, 40)
+    torch.testing.assert_close(phi["clearance"], want.expand(2, 80))
+    assert torch.equal(phi["collision"], (want < 0).float().expand(2, 80))
+    assert 0 < phi["collision"].sum() < 160
+
+
+def test_road_edge_is_that_of_the_corner_farthest_out() -> None:
+    scene = straight_road(2)
+    assert of_log(scene)[0]["road_edge"][0, 0] == pytest.approx(-(2.5 - CAR[1] / 2))
+    scene.agents.position[..., 1] = -7.0
+    assert of_log(scene)[0]["road_edge"][0, 0] == pytest.approx(2.0 + CAR[1] / 2)
+
+
+def test_an_agent_alone_has_the_largest_clearance() -> None:
+    phi, _ = of_log(straight_road(1))
+    assert phi["clearance"].unique().tolist() == [FEATURES["clearance"].clip[1]]
+    assert not phi["collision"].any()
+
+
+def test_a_hole_in_the_log_costs_the_steps_that_need_it_and_effort_does_not_explode() -> None:
+    scene = circling()
+    hole = slice(CURRENT_STEP + 31, CURRENT_STEP + 34)
+    scene.agents.valid[0, hole] = False
+    scene.agents.position[0, hole] = 0
+    phi, valid = of_log(scene)
+    assert (~valid[0]).nonzero()[:, 0].tolist() == [30, 31, 32, 33, 34]
+    torch.testing.assert_close(phi["effort"][0, valid[0]], torch.full((75,), 3.2), atol=0.02, rtol=0)
+    assert all(not value[0, ~valid[0]].any() for value in phi.values())
+
+
+@pytest.mark.parametrize(("name", "lost"), [("clearance", 0), ("speed", 1), ("effort", 2)])
+def test_missing_history_costs_the_first_steps_of_features_that_look_back(name: str, lost: int) -> None:
+    scene = straight_road(1)
+    scene.agents.valid[0, CURRENT_STEP - 1] = False
+    _, valid = of_log(scene, name)
+    assert (~valid).sum() == max(lost - 1, 0)
+    scene.agents.valid[0, CURRENT_STEP + 1] = False
+    assert (~of_log(scene, name)[1]).sum() == 1 + lost
+
+
+def test_a_neighbour_missing_in_the_log_is_missing_for_rollouts_too() -> None:
+    scene = two_cars_head_on()
+    scene.agents.valid[1, CURRENT_STEP + 1 :] = False
+    log = log_trajectory(scene, 80)
+    rollout = two_cars_head_on().agents
+    rollout = torch.cat((rollout.position, rollout.heading[..., None]), -1)[:, CURRENT_STEP + 1 :]
+    phi, valid = occupancy_features(scene, torch.stack((rollout, log)), ["collision", "clearance"])
+    assert torch.equal(phi[0], phi[1])
+    assert valid.tolist() == [[True] * 80, [False] * 80]
+
+
+def test_agents_absent_at_the_current_step_are_no_obstacles() -> None:
+    scene = two_cars_head_on()
+    scene.agents.valid[1, CURRENT_STEP] = False
+    phi, valid = of_log(scene)
+    assert valid.shape == (1, 80)
+    assert not phi["collision"].any()
+
+
+def test_ego_and_stride_select_from_the_full_features() -> None:
+    scene = straight_road(4, seed=0)
+    full, full_valid = occupancy_features(scene, log_trajectory(scene, 80)[None])
+    ego = torch.tensor([3, 1])
+    some, valid = occupancy_features(scene, log_trajectory(scene, 80)[None], ego=ego, stride=5)
+    assert torch.equal(some, full[:, ego][:, :, 4::5])
+    assert torch.equal(valid, full_valid[ego][:, 4::5])
+
+
+def test_values_are_clipped_to_the_range_in_force() -> None:
+    scene = straight_road(2, speed=30.0)
+    assert of_log(scene)[0]["speed"].unique().tolist() == [25.0]
+    assert of_log(scene, clips={"speed": (0.0, 10.0)})[0]["speed"].unique().tolist() == [10.0]
+
+
+def test_a_registered_feature_joins_the_measure() -> None:
+    @register("lane_offset", unit="m", clip=(0.0, 5.0), weight=2.0)
+    def lane_offset(motion):
+        return motion.ego_poses()[..., 1].abs()
+
+    try:
+        phi, _ = of_log(straight_road(1), "speed", "lane_offset")
+        assert phi["lane_offset"].unique().tolist() == [2.5]
+        assert feature_weights(["speed", "lane_offset"]).tolist() == [1, 2]
+        with pytest.raises(ValueError, match="registered already"):
+            register("lane_offset", unit="m", clip=(0.0, 5.0), weight=2.0)
+    finally:
+        del FEATURES["lane_offset"]
+
+
+def test_bad_options_are_refused_with_the_value() -> None:
+    scene = straight_road(2)
+    log = log_trajectory(scene, 80)[None]
+    with pytest.raises(ValueError, match="'safety'.*'full'"):
+        occupancy_features(scene, log, "safety")
+    with pytest.raises(ValueError, match="'jerk'"):
+        occupancy_features(scene, log, ["speed", "jerk"])
+    with pytest.raises(ValueError, match="clips are given for"):
+        occupancy_features(scene, log, ["speed"], clips={"effort": (0, 1)})
+    with pytest.raises(ValueError, match="got 0"):
+        occupancy_features(scene, log, stride=0)
+    with pytest.raises(ValueError, match=r"\[R, 2, T, 4\]"):
+        occupancy_features(scene, log[:, :1])
+    with pytest.raises(ValueError, match="past steps, got 3"):
+        register("jerk", unit="m/s^3", clip=(0, 1), weight=1.0, past=3)

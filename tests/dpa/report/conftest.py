@@ -1,0 +1,44 @@
+"""A small comparison with everything that a real one has."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+
+@pytest.fixture
+def comparison() -> dict[str, Any]:
+    """Two methods with two seeds each against a reference that was sampled in two ways."""
+
+    def row(method: str, seed: int, top_p: float, realism: float, pair_accuracy: float | None) -> dict[str, Any]:
+        return {
+            "method": method, "seed": seed, "top_p": top_p, "n_scenes": 54, "kinematic": 0.4, "interactive": 0.75,
+            "map_based": 0.8, "realism": realism, "min_ade": 1.4, "collision_rate": 0.2, "offroad_rate": 0.1,
+            "preference_distance": 5.0, "pair_accuracy": pair_accuracy,
+        }  # fmt: skip
+
+    return {
+        "metric": "2024",
+        "scenes": {"train": 100, "tune": 24, "eval": 54, "source": "made & up <by hand>"},
+        "rows": [
+            row("reference", 0, 0.95, 0.700, None),
+            row("reference", 0, 0.85, 0.705, None),
+            row("DPA-OMF", 0, 0.95, 0.716, 0.62),
+            row("DPA-OMF", 1, 0.95, 0.720, 0.66),
+            row("DPA-ADEF", 0, 0.95, 0.702, 0.6),
+            row("DPA-ADEF", 1, 0.95, 0.704, 0.6),
+        ],
+        "paired": [
+            {"method": "DPA-OMF", "realism_difference": 0.018, "ci95": [0.006, 0.03], "over": "seeds and scenes",
+             "n_seeds": 2},
+            {"method": "DPA-ADEF", "realism_difference": 0.003, "ci95": [-0.004, 0.01], "over": "seeds and scenes",
+             "n_seeds": 2},
+        ],
+        "per_scene": {},
+        "seeds": [0, 1],
+        "stages": {"pretrain": 3600.0, "align": 125.0},
+        "wall_seconds": 4000.0,
+        "versions": {"torch": "2.13.0"},
+        "command": "python -m recipes.compare 'name=<b>'",
+    }  # fmt: skip

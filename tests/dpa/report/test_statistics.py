@@ -1,0 +1,144 @@
+"""Intervals cover what they promise, pair what belongs together, and name what is missing."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dpa.report.statistics import SCENES, SEEDS_AND_SCENES, compare_methods, paired_bootstrap, summary
+
+
+def simulated(rng: np.random.Generator, num_seeds: int, seed_sd: float, gain: float = 0.01) -> np.ndarray:
+    """``[seeds, scenes]`` differences with an effect of the scene (shared by seeds), of the run, and noise."""
+    scene, run = rng.normal(0, 0.03, (1, 54)), rng.normal(0, seed_sd, (num_seeds, 1))
+    return gain + scene + run + rng.normal(0, 0.03, (num_seeds, 54))
+
+
+def test_identical_methods_differ_by_exactly_nothing() -> None:
+    scores = np.random.default_rng(0).random((3, 20))
+    found = paired_bootstrap(scores, scores)
+    assert (found.mean, found.low, found.high) == (0, 0, 0)
+    assert not found.excludes_zero
+
+
+@settings(max_examples=20, deadline=None)
+@given(shift=st.floats(-1, 1), seeds=st.integers(1, 4), scenes=st.integers(1, 10))
+def test_a_constant_shift_has_no_uncertainty(shift: float, seeds: int, scenes: int) -> None:
+    scores = np.random.default_rng(1).random((seeds, scenes))
+    found = paired_bootstrap(scores + shift, scores, num_resamples=200)
+    assert (found.mean, found.low, found.high) == pytest.approx((shift, shift, shift), abs=1e-12)
+    assert found.over == (SCENES if seeds == 1 else SEEDS_AND_SCENES)
+    assert (found.num_seeds, found.num_scenes) == (seeds, scenes)
+
+
+def test_resampling_scenes_agrees_with_the_standard_error_of_the_mean() -> None:
+    values = np.random.default_rng(2).normal(0.5, 0.1, (1, 400))
+    found = summary(values)
+    error = values.std(ddof=1) / math.sqrt(400)
+    assert found.high - found.low == pytest.approx(2 * 1.96 * error, rel=0.05)
+
+
+def test_pairing_takes_the_spread_between_scenes_away() -> None:
+    rng = np.random.default_rng(3)
+    easy_and_hard = rng.normal(0.6, 0.2, (1, 54))
+    better = easy_and_hard + 0.01 + rng.normal(0, 0.01, (1, 54))
+    assert paired_bootstrap(better, easy_and_hard).excludes_zero
+    assert summary(better).high - summary(better).low > 0.05
+
+
+def test_seeds_that_disagree_widen_the_interval() -> None:
+    rng = np.random.default_rng(4)
+    alike, apart = (simulated(rng, 3, sd) for sd in (0.0, 0.05))
+    zero = np.zeros((1, 54))
+    narrow, wide = paired_bootstrap(alike, zero), paired_bootstrap(apart, zero)
+    assert wide.high - wide.low > 1.5 * (narrow.high - narrow.low)
+
+
+@pytest.mark.parametrize(("seeds", "seed_sd", "least"), [(1, 0.0, 0.88), (3, 0.01, 0.85), (5, 0.01, 0.88)])
+def test_the_interval_holds_the_true_gain_about_as_often_as_it_says(seeds: int, seed_sd: float, least: float) -> None:
+    rng, trials, held = np.random.default_rng(5), 200, 0
+    for trial in range(trials):
+        values = simulated(rng, seeds, seed_sd)
+        found = paired_bootstrap(values, np.zeros((1, 54)), num_resamples=500, seed=trial)
+        held += found.low <= 0.01 <= found.high
+    assert least <= held / trials
+
+
+def test_one_seed_knows_nothing_of_the_spread_between_runs() -> None:
+    rng = np.random.default_rng(6)
+    held = 0
+    for _ in range(200):
+        found = paired_bootstrap(simulated(rng, 1, 0.01), np.zeros((1, 54)), num_resamples=500)
+        held += found.low <= 0.01 <= found.high
+    assert held / 200 < 0.8
+    assert found.over == SCENES
+
+
+def test_draws_are_reproducible_and_one_reference_serves_all_seeds() -> None:
+    rng = np.random.default_rng(7)
+    values, reference = rng.random((3, 30)), rng.random((1, 30))
+    assert paired_bootstrap(values, reference, seed=1) == paired_bootstrap(values, reference, seed=1)
+    assert paired_bootstrap(values, reference) == paired_bootstrap(values, reference.repeat(3, 0))
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_score_that_is_not_finite_is_named(bad: float) -> None:
+    values, reference = np.zeros((2, 5)), np.zeros((2, 5))
+    reference[1, 3] = bad
+    with pytest.raises(ValueError, match=rf"reference: row \(seed\) 1, column \(scene\) 3 is {bad}"):
+        paired_bootstrap(values, reference)
+
+
+@pytest.mark.parametrize("shape", [(2, 4), (3, 5)])
+def test_what_does_not_pair_is_refused(shape: tuple[int, int]) -> None:
+    with pytest.raises(ValueError, match=r"\[2, 5\] and reference \[\d, \d\] do not pair"):
+        paired_bootstrap(np.zeros((2, 5)), np.zeros(shape))
+
+
+def test_a_row_of_scores_without_seeds_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"\[seeds, scenes\].*got shape \[5\]"):
+        summary(np.zeros(5))
+
+
+def test_methods_are_paired_with_the_reference_run_of_the_same_seed() -> None:
+    scores = {
+        "reference": {"0": [0.0, 0.0], "1": [1.0, 1.0]},
+        "A": {"1": [1.5, 1.5], "0": [0.5, 0.5]},  # order of the seeds does not matter
+        "B": {"1": [0.9, 0.9]},
+    }
+    first, second = compare_methods(scores, "reference", num_resamples=50)
+    assert first == {
+        "method": "A",
+        "realism_difference": 0.5,
+        "ci95": [0.5, 0.5],
+        "over": SEEDS_AND_SCENES,
+        "n_seeds": 2,
+    }
+    assert second["realism_difference"] == pytest.approx(-0.1)
+    assert second["over"] == SCENES
+
+
+@pytest.mark.parametrize(
+    ("runs", "message"),
+    [
+        ({"7": [0.0, 0.0]}, r"A: seeds \['7'\] have no run of 'reference'"),
+        ({"0": [0.0]}, "A against reference: .*do not pair"),
+        ({"0": [0.0, 0.0], "1": [0.0]}, "A against reference: .*different numbers of scenes"),
+    ],
+)
+def test_a_method_that_cannot_be_compared_is_named(runs: dict[str, list[float]], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        compare_methods({"reference": {"0": [0.0, 0.0], "1": [0.0, 0.0]}, "A": runs}, "reference", num_resamples=10)
+
+
+def test_a_missing_reference_is_named() -> None:
+    with pytest.raises(ValueError, match="no method 'reference'"):
+        compare_methods({"A": {"0": [0.0]}}, "reference")
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])

@@ -1,0 +1,222 @@
+"""GPUDrive JSON -> scenes: both dialects."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import lzma
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envs.scene import AgentKind, LightState, MapKind, SceneError
+from envs.sources.gpudrive import read_gpudrive
+from envs.sources.womd import read_womd
+
+
+def track(x: float, heading: float, **more: Any) -> dict[str, Any]:
+    return {
+        "position": [{"x": x + 0.5 * step, "y": 200.0, "z": 5.0} for step in range(91)],
+        "heading": [heading] * 91,
+        "velocity": [{"x": 5.0, "y": 0.0}] * 91,
+        "valid": [True] * 91,
+        "length": 4.5,
+        "width": 2.0,
+        "height": 1.5,
+        "type": "vehicle",
+        **more,
+    }
+
+
+def road(kind: str, xs: tuple[float, ...], **more: Any) -> dict[str, Any]:
+    return {"geometry": [{"x": x, "y": 195.0, "z": 5.0} for x in xs], "type": kind, **more}
+
+
+@pytest.fixture
+def newer() -> dict[str, Any]:
+    return {
+        "name": "x",
+        "scenario_id": "newer",
+        "objects": [track(1000.0, 0.1, id=7), track(1020.0, -3.0, id=9, type="cyclist")],
+        "roads": [
+            road("lane", (900.0, 1100.0), id=3, map_element_id=2),
+            road("road_edge", (900.0, 1100.0), id=4, map_element_id=16),
+        ],
+        "tl_states": {},
+        "metadata": {"sdc_track_index": 0, "objects_of_interest": [], "tracks_to_predict": [{"track_index": 1}]},
+    }
+
+
+@pytest.fixture
+def older() -> dict[str, Any]:
+    return {
+        "name": "x",
+        "scenario_id": "older",
+        "objects": [track(1000.0, 360.0), track(1020.0, -90.0)],
+        "roads": [road("lane", (900.0, 1100.0)), road("road_edge", (900.0, 1100.0)), road("stop_sign", (950.0,))],
+        "tl_states": {
+            "0": {"state": ["stop", "arrow_go"], "x": [1.0, 2.0], "y": [0, 0], "z": [0, 0], "time_index": [4, 5]}
+        },
+    }
+
+
+@pytest.fixture
+def save(tmp_path: Path) -> Callable[..., Path]:
+    def write(data: Any, name: str = "scene.json") -> Path:
+        packers = {".json": bytes, ".gz": gzip.compress, ".xz": lzma.compress}
+        path = tmp_path / name
+        path.write_bytes(packers[path.suffix](json.dumps(data).encode()))
+        return path
+
+    return write
+
+
+def test_newer_dialect(newer, save) -> None:
+    scene = read_gpudrive(save(newer))
+    agents, road_map = scene.agents, scene.road
+    assert scene.origin.tolist() == [1005.0, 200.0, 5.0]
+    assert agents.position[1, 0].tolist() == [15.0, 0.0, 0.0]
+    assert agents.heading[:, 0].tolist() == pytest.approx([0.1, -3.0])
+    assert agents.track_id.tolist() == [7, 9]
+    assert agents.kind.tolist() == [AgentKind.VEHICLE, AgentKind.CYCLIST]
+    assert agents.sdc.tolist() == [True, False]
+    assert agents.predict.tolist() == [False, True]
+    assert agents.extent[0].tolist() == [4.5, 2.0, 1.5]
+    assert road_map.kind.tolist() == [MapKind.LANE_SURFACE_STREET, MapKind.EDGE_MEDIAN]
+    assert road_map.feature_id.tolist() == [3, 4]
+    assert len(scene.lights.lane_id) == 0
+
+
+def test_older_dialect_has_degrees_no_ids_and_the_sdc_last(older, save) -> None:
+    scene = read_gpudrive(save(older))
+    assert scene.agents.heading[:, 0].tolist() == pytest.approx([0.0, -math.pi / 2], abs=1e-6)
+    assert scene.agents.track_id.tolist() == [0, 1]
+    assert scene.agents.sdc.tolist() == [False, True]
+    assert not scene.agents.predict.any()
+    assert scene.road.kind.tolist() == [MapKind.LANE_UNDEFINED, MapKind.EDGE_UNKNOWN, MapKind.STOP_SIGN]
+    assert scene.lights.state[0, 3:7].tolist() == [
+        LightState.ABSENT,
+        LightState.STOP,
+        LightState.ARROW_GO,
+        LightState.ABSENT,
+    ]
+
+
+def test_a_heading_of_pi_in_float32_is_not_taken_for_degrees(newer, save) -> None:
+    newer["objects"][1]["heading"] = [float(np.float32(math.pi))] * 91
+    assert read_gpudrive(save(newer)).agents.heading[1, 0].item() == pytest.approx(math.pi)
+
+
+def test_headings_in_radians_that_are_not_wrapped_stay_radians(newer, save) -> None:
+    newer["objects"][0]["heading"] = [2 * math.pi + 0.1] * 91
+    newer["objects"][1]["heading"] = [0.0] * 91
+    assert read_gpudrive(save(newer)).agents.heading[0, 0].item() == pytest.approx(2 * math.pi + 0.1)
+
+
+def test_invalid_steps_may_hold_anything(newer, save) -> None:
+    item = newer["objects"][1]
+    item["valid"][20] = False
+    item["heading"][20] = -10000.0
+    item["position"][20] = dict.fromkeys("xyz", -10000.0)
+    agents = read_gpudrive(save(newer)).agents
+    assert agents.heading[0, 0].item() == pytest.approx(0.1)
+    assert not agents.position[1, 20].any()
+
+
+def test_packed_files_give_the_same_scene(newer, save) -> None:
+    plain, *packed = (read_gpudrive(save(newer, f"scene.json{end}")) for end in ("", ".gz", ".xz"))
+    for scene in packed:
+        assert (scene.agents == plain.agents).all()
+
+
+def drop(name: str):
+    return lambda data: data.pop(name)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (drop("objects"), "entry 'objects' is missing"),
+        (drop("scenario_id"), "entry 'scenario_id' is missing"),
+        (lambda data: data["objects"].clear(), "no objects"),
+        (lambda data: data["objects"][0]["heading"].pop(), "object 0 has 90 steps of heading"),
+        (lambda data: data["objects"][0]["position"][3].update(x=math.nan), "track 7 has position nan"),
+        (lambda data: data["objects"][0].update(type="tram"), "object type is 'tram'"),
+        (lambda data: data["objects"][0].update(valid=7), "not a GPUDrive scene"),
+        (lambda data: data["metadata"].update(sdc_track_index=5), "SDC is track 5 of 2"),
+        (lambda data: data["roads"][0].update(map_element_id=44), "MapKind 44"),
+        (lambda data: data["roads"].pop(), "no road edge"),
+    ],
+)
+def test_an_unusable_file_is_named(newer, save, change, message: str) -> None:
+    change(newer)
+    with pytest.raises(SceneError, match=rf"scene\.json.*{message}"):
+        read_gpudrive(save(newer))
+
+
+@pytest.mark.parametrize("suffix", [".json", ".gz", ".xz"])
+def test_a_damaged_file_is_named(newer, save, suffix: str) -> None:
+    path = save(newer, f"scene{suffix}")
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(SceneError, match=f"scene{suffix}.*not a GPUDrive scene"):
+        read_gpudrive(path)
+
+
+def real_files(shared: Path, folder: str, count: int) -> list[Path]:
+    return sorted((shared / "scenes/gpudrive" / folder).glob("*.json.xz"))[:count]
+
+
+@pytest.mark.parametrize("folder", ["train", "val", "lights"])
+def test_real_scenes_head_where_they_travel_and_equal_their_file(shared: Path, folder: str) -> None:
+    for path in real_files(shared, folder, 3):
+        scene = read_gpudrive(path)
+        with lzma.open(path, "rt") as file:
+            data = json.load(file)
+        agents = scene.agents
+        for index, item in enumerate(data["objects"]):
+            steps = [step for step, ok in enumerate(item["valid"]) if ok]
+            assert agents.valid[index].nonzero().flatten().tolist() == steps
+            world = np.array([[item["position"][step][axis] for axis in "xyz"] for step in steps])
+            np.testing.assert_array_equal(agents.position[index, steps], (world - scene.origin.numpy()).astype("f4"))
+        fast = agents.valid & (agents.velocity.norm(dim=-1) > 4) & (agents.kind == AgentKind.VEHICLE)[:, None]
+        travel, heading = agents.velocity[fast], agents.heading[fast]
+        along = travel[:, 0] * heading.cos() + travel[:, 1] * heading.sin()
+        assert (along / travel.norm(dim=-1)).median() > 0.999
+        assert scene.road.count.tolist() == [len(item["geometry"]) for item in data["roads"]]
+        assert agents.sdc.nonzero().tolist() == [[len(data["objects"]) - 1]]
+
+
+def test_real_lights_are_read(shared: Path) -> None:
+    scenes = [read_gpudrive(path) for path in real_files(shared, "lights", 5)]
+    assert [len(scene.lights.lane_id) for scene in scenes] == [19, 5, 7, 0, 12]
+    for scene in scenes:
+        assert set(scene.lights.lane_id.tolist()) <= set(scene.road.feature_id.tolist())
+
+
+def test_a_real_radian_recording_that_passes_pi_is_not_turned(shared: Path, save) -> None:
+    (scene,) = read_womd(shared / "scenes/womd/womd_scenario_input.tfrecord")
+    agents = scene.agents
+    assert agents.heading.abs().max() > 2 * math.pi
+    objects = [
+        {
+            "position": [dict(zip("xyz", point, strict=True)) for point in agents.position[a].tolist()],
+            "heading": agents.heading[a].tolist(),
+            "velocity": [dict(zip("xy", pair, strict=True)) for pair in agents.velocity[a].tolist()],
+            "valid": agents.valid[a].tolist(),
+            **dict(zip(("length", "width", "height"), agents.extent[a].tolist(), strict=True)),
+            "type": AgentKind(int(agents.kind[a])).name.lower(),
+        }
+        for a in range(len(agents.kind))
+    ]
+    metadata = {"sdc_track_index": int(agents.sdc.nonzero()), "tracks_to_predict": []}
+    edge = road("road_edge", (0.0, 1.0))
+    path = save({"scenario_id": "w", "objects": objects, "roads": [edge], "tl_states": {}, "metadata": metadata})
+    np.testing.assert_array_equal(read_gpudrive(path).agents.heading, agents.heading)
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])
