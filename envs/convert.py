@@ -161,7 +161,7 @@ def _locked(folder: Path) -> Iterator[None]:
 def _resume(out: Path, manifest: Manifest) -> bool:
     """Prepare the folder; true if it holds the finished conversion already."""
     if not (out / MANIFEST_FILE).exists():
-        foreign = [path.name for path in out.iterdir() if not path.name.startswith(PARTIAL_PREFIX)]
+        foreign = sorted(path.name for path in out.iterdir() if not path.name.startswith(PARTIAL_PREFIX))
         if foreign:
             raise SceneError(f"{out}: holds {foreign[0]!r} and no store; give a new or empty folder.")
         write_manifest(out, manifest)

@@ -34,10 +34,10 @@ PARTIAL_PREFIX = ".partial-"
 """Folders and files that are being written; left over only by a process that was killed."""
 
 _PARTS = {"agents": Agents, "road": RoadMap, "lights": Lights}
-_AT_VALID_STATES = {"agents.position", "agents.heading", "agents.velocity"}
+_AT_VALID_STATES = ("agents.heading", "agents.position", "agents.velocity")
 _ROWS = {
     "agents": ["agents.valid", "agents.extent", "agents.kind", "agents.track_id", "agents.predict", "agents.sdc"],
-    "states": sorted(_AT_VALID_STATES),
+    "states": list(_AT_VALID_STATES),
     "points": ["road.points"],
     "polylines": ["road.start", "road.count", "road.kind", "road.feature_id", "road.speed_limit"],
     "links": ["road.links"],
@@ -197,10 +197,11 @@ def _flatten(scene: Scene) -> dict[str, Tensor]:
 def _unflatten(piece: dict[str, Tensor], scene_id: str) -> Scene:
     """Inverse of :func:`_flatten`."""
     valid = piece["agents.valid"]
+    rows = valid.flatten().nonzero().squeeze(1)
     for name in _AT_VALID_STATES:
         states = piece[name]
-        piece[name] = states.new_zeros(valid.shape + states.shape[1:])
-        piece[name][valid] = states
+        filled = states.new_zeros(valid.numel(), *states.shape[1:]).index_copy_(0, rows, states)
+        piece[name] = filled.view(valid.shape + states.shape[1:])
     parts = {
         part: cls(**{name: piece[f"{part}.{name}"] for name in cls.__dataclass_fields__}, batch_size=[])
         for part, cls in _PARTS.items()
@@ -242,8 +243,9 @@ def _map(folder: Path, name: str, entry: dict[str, Any]) -> Tensor:
     """Map one array; not through ``TensorDict.load_memmap``, whose mappings are shared with the file."""
     path, dtype, shape = _array_path(folder, name), getattr(torch, entry["dtype"]), torch.Size(entry["shape"])
     expected = shape.numel() * dtype.itemsize
-    size = path.stat().st_size if path.is_file() else None
-    if size != expected:
+    if not path.is_file():
+        raise SceneError(f"{path}: the file is missing; convert the scenes again.")
+    if (size := path.stat().st_size) != expected:
         raise SceneError(f"{path}: {size} bytes where {expected} are needed; convert the scenes again.")
     if not expected:
         return torch.empty(shape, dtype=dtype)

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from dpa.policy.context import ContextOptions, SceneContext, collate_contexts, make_context
-from dpa.policy.decoder import KeyValues, NodeCache, NodeInputs, SceneMemory
+from dpa.policy.decoder import NodeCache, NodeInputs, SceneMemory
 from dpa.policy.motionlm import MotionLM
 from envs import keys
 from envs.scene import SceneSource

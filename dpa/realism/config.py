@@ -155,4 +155,6 @@ def _check_keys(data: Any, expected: set[str], path: Path, where: str) -> None:
         raise ValueError(f"{path}: {where} must map the keys {sorted(expected)} to values, got {data!r}.")
     unknown, missing = sorted(map(str, set(data) - expected)), sorted(expected - set(data))
     if unknown or missing:
-        raise ValueError(f"{path}: {where} has unknown keys {unknown} and lacks {missing}; it needs {sorted(expected)}.")
+        raise ValueError(
+            f"{path}: {where} has unknown keys {unknown} and lacks {missing}; it needs {sorted(expected)}."
+        )

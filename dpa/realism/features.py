@@ -17,7 +17,17 @@ from dpa.realism.lights import red_light_violation
 from envs.geometry.boxes import nearest_box_distance
 from envs.geometry.edges import RoadEdges
 from envs.geometry.frames import rotate, wrap_angle
-from envs.scene import CURRENT_STEP, EDGE_KINDS, LOG_STEPS, STEP_SECONDS, AgentKind, Scene, polylines, select_agents
+from envs.scene import (
+    CURRENT_STEP,
+    EDGE_KINDS,
+    LOG_STEPS,
+    STEP_SECONDS,
+    AgentKind,
+    LightState,
+    Scene,
+    polylines,
+    select_agents,
+)
 
 HORIZON = LOG_STEPS - CURRENT_STEP - 1
 """Simulated steps, and steps that are scored."""
@@ -84,7 +94,7 @@ def measure(scene: Scene, simulated: Tensor, config: RealismConfig) -> Features:
         simulated: ``[R, A, 80, 4]``, x, y, z, heading of the present agents in their order.
         config: which options apply.
     """
-    scene, simulated = in_world(scene, simulated)
+    scene, simulated = to_world(scene, simulated)
     scene = select_agents(scene, scene.agents.present)
     agents = scene.agents
     ego = agents.evaluated.nonzero()[:, 0]
@@ -114,17 +124,31 @@ def measure(scene: Scene, simulated: Tensor, config: RealismConfig) -> Features:
     )
 
 
-def in_world(scene, simulated):
-    origin = scene.origin.clone()
-    def move(points):
-        return (points.double() + origin).float()
-    scene = scene.clone()
-    scene.agents.position = torch.where(scene.agents.valid[..., None], move(scene.agents.position), 0)
-    scene.agents.heading = torch.where(scene.agents.valid, scene.agents.heading, 0)
-    scene.road.points = move(scene.road.points)
-    scene.lights.stop_point = torch.where((scene.lights.state == -1)[..., None], 0, move(scene.lights.stop_point))
-    scene.origin = torch.zeros_like(scene.origin)
-    return scene, torch.cat((move(simulated[..., :3]), simulated[..., 3:]), -1)
+def to_world(scene: Scene, simulated: Tensor) -> tuple[Scene, Tensor]:
+    """Give one uncollated scene and its rollouts the coordinates that the official code works on.
+
+    Those are the source's own in float32, and zero for all that is invalid or absent. This zero matters: accelerations
+    reach back to invalid history, and red lights to absent stop points (SPEC sections 2.2 and 4.2).
+
+    Args:
+        scene: a scene.
+        simulated: ``[R, A, 80, 4]``, x, y, z, heading.
+    """
+
+    def move(points: Tensor) -> Tensor:
+        return (points.double() + scene.origin).to(points.dtype)
+
+    agents, lights = scene.agents.clone(recurse=False), scene.lights.clone(recurse=False)
+    agents.position = torch.where(agents.valid[..., None], move(agents.position), 0)
+    agents.heading = torch.where(agents.valid, agents.heading, 0)
+    absent = lights.state == LightState.ABSENT
+    lights.stop_point = torch.where(absent[..., None], 0, move(lights.stop_point))
+    road = scene.road.clone(recurse=False)
+    road.points = move(road.points)
+    moved = scene.clone(recurse=False)
+    moved.agents, moved.lights, moved.road = agents, lights, road
+    moved.origin = torch.zeros_like(scene.origin)
+    return moved, torch.cat((move(simulated[..., :3]), simulated[..., 3:]), -1)
 
 
 def _join(scene: Scene, simulated: Tensor, ego: Tensor) -> _Tracks:
@@ -190,7 +214,7 @@ def _nearest_object(tracks: _Tracks, rounding: float) -> Tensor:
 
 
 def _time_to_collision(tracks: _Tracks) -> Tensor:
-    """Time until each evaluated agent reaches its leader at the present speeds (SPEC section 3.2) -> ``[C, E, 80]`` [s]."""
+    """Time until evaluated agents reach their leaders at present speeds (SPEC section 3.2) -> ``[C, E, 80]`` [s]."""
     speed = _speed(tracks.position[..., :2])[..., _CONTEXT:]
     position, heading = tracks.position[:, :, _CONTEXT:, :2], tracks.heading[:, :, _CONTEXT:]
     valid = tracks.valid[:, :, _CONTEXT:]

@@ -32,7 +32,8 @@ def red_light_violation(scene: Scene, position: Tensor, valid: Tensor) -> Tensor
     """Steps at which agents pass the stop point of the lane that they are on while its light is red.
 
     Args:
-        scene: an uncollated scene, for its lanes and lights.
+        scene: an uncollated scene in the frame of the world (:func:`dpa.realism.features.to_world`), for its lanes
+            and lights.
         position: ``[C, E, 81, 2]``, centres from the current step on [m].
         valid: ``[C, E, 81]`` bool.
 
@@ -70,7 +71,7 @@ def _surface_lanes(scene: Scene) -> _Lanes | None:
     index = ((road.kind == MapKind.LANE_SURFACE_STREET) & (road.count >= 2)).nonzero()[:, 0]
     if not len(index):
         return None
-    world_origin = -scene.origin[None, :2].to(road.points.dtype)
+    world_origin = road.points.new_zeros(1, 2)
     longest = int(road.count[index].max())
     lines = []
     for start, count in zip(road.start[index].tolist(), road.count[index].tolist(), strict=True):
@@ -85,16 +86,9 @@ def _surface_lanes(scene: Scene) -> _Lanes | None:
 
 
 def _signals(scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
-    """Lanes ``[G]``, states ``[G, 81]`` and stop points ``[G, 81, 2]`` from the current step on.
-
-    Where a step does not list a lane, the official code has an unknown state and the origin of the world.
-    """
+    """Lanes ``[G]``, states ``[G, 81]`` and stop points ``[G, 81, 2]`` of the lights from the current step on."""
     lights = scene.lights
-    state = lights.state[:, CURRENT_STEP:]
-    absent = state == LightState.ABSENT
-    world_origin = -scene.origin[:2].to(lights.stop_point.dtype)
-    stop = torch.where(absent[..., None], world_origin, lights.stop_point[:, CURRENT_STEP:, :2])
-    return lights.lane_id, torch.where(absent, int(LightState.UNKNOWN), state), stop
+    return lights.lane_id, lights.state[:, CURRENT_STEP:], lights.stop_point[:, CURRENT_STEP:, :2]
 
 
 def _passes(position: Tensor, stop: Tensor, start: Tensor, delta: Tensor) -> Tensor:

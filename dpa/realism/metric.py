@@ -165,8 +165,8 @@ def _check(scene: Scene, simulated: Tensor) -> None:
     agents = int(scene.agents.present.sum())
     if simulated.ndim != 4 or not len(simulated) or simulated.shape[1:] != (agents, HORIZON, 4):
         raise ValueError(
-            f"scene {scene.scene_id}: rollouts must have shape [R, {agents}, {HORIZON}, 4] (rollouts, agents present at "
-            f"the current step, steps, x y z heading) with R >= 1, got {list(simulated.shape)}."
+            f"scene {scene.scene_id}: rollouts must have shape [R, {agents}, {HORIZON}, 4] (rollouts, agents present "
+            f"at the current step, steps, x y z heading) with R >= 1, got {list(simulated.shape)}."
         )
     finite = torch.isfinite(simulated)
     if not finite.all():

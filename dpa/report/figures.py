@@ -73,6 +73,7 @@ def _forest(axes: Axes, records: list[dict[str, Any]]) -> None:
             text, (mean, row), (0, 8), textcoords="offset points", ha="center", fontsize=7.5, color=INK,
             bbox={"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none"},
         )  # fmt: skip
+    axes.margins(x=0.15)  # room for the letters of the outermost intervals
     axes.set_title("realism minus the reference's, 95 % interval")
 
 

@@ -29,7 +29,7 @@ class Picture(NamedTuple):
 
     Attributes:
         path: a PNG; its bytes are copied into the page.
-        caption: what it shows.
+        caption: what it shows; the first sentence becomes the heading.
     """
 
     path: str | Path
@@ -129,10 +129,12 @@ def _figure(picture: Picture) -> str:
     content = Path(picture.path).read_bytes()
     if not content.startswith(b"\x89PNG"):
         raise ValueError(f"{picture.path} is not a PNG; a page shows PNG figures.")
-    data, caption = base64.b64encode(content).decode("ascii"), escape(picture.caption)
+    data = base64.b64encode(content).decode("ascii")
+    heading, _, rest = picture.caption.partition(". ")
     return (
-        f"<h2>{caption.partition('. ')[0].rstrip('.')}</h2>\n"
-        f'<figure><img alt="{caption}" src="data:image/png;base64,{data}"><figcaption>{caption}</figcaption></figure>'
+        f"<h2>{escape(heading.rstrip('.'))}</h2>\n"
+        f'<figure><img alt="{escape(picture.caption)}" src="data:image/png;base64,{data}">'
+        f"<figcaption>{escape(rest)}</figcaption></figure>"
     )
 
 

@@ -100,7 +100,9 @@ def nearest_box_distance(
     """
     num_agents = boxes.shape[-2]
     if valid.shape != boxes.shape[:-1]:
-        raise ValueError(f"valid must have shape {tuple(boxes.shape[:-1])} (boxes without the last dim), got {tuple(valid.shape)}.")
+        raise ValueError(
+            f"valid must have shape {tuple(boxes.shape[:-1])} (boxes without the last dim), got {tuple(valid.shape)}."
+        )
     ego = torch.arange(num_agents, device=boxes.device) if ego is None else ego
     flat, flat_valid = boxes.reshape(-1, num_agents, 5), valid.reshape(-1, num_agents)
     rows = max(1, _PAIRS_PER_CHUNK // max(1, num_agents * len(ego)))

@@ -23,8 +23,8 @@ CYCLE_GAP = 1.0
 
 _CELL_SIZES = (32.0, 8.0, 1.0)
 """Sides of the cells in which queries share their candidate segments, from coarse to fine [m]."""
-_MARGIN = 1e-5
-"""Room for float32 rounding when a segment is ruled out for a cell [m, and part of the distance]."""
+_MARGIN = 1e-6
+"""Room for float32 rounding when a segment is ruled out for a cell, as a part of the largest coordinate."""
 _NO_SEGMENT = -1
 
 
@@ -64,7 +64,9 @@ class RoadEdges:
         """
         lines = [line for line in lines if len(line) >= 2]
         if not lines:
-            raise ValueError("no road edge has two points or more, so no distance to the road edge is defined; add one.")
+            raise ValueError(
+                "no road edge has two points or more, so no distance to the road edge is defined; add one."
+            )
         longest = max(map(len, lines))
         previous, following = [], []
         first = 0
@@ -118,7 +120,8 @@ class RoadEdges:
 
         Examples:
             >>> edges = RoadEdges.from_polylines([torch.tensor([[-50.0, 0, 0], [50, 0, 0]])])
-            >>> edges.box_offroad_distance(torch.tensor([0.0, 0.5, 0.8]), torch.tensor(0.0), torch.tensor([4.6, 2.0, 1.6]))
+            >>> centre, extent = torch.tensor([0.0, 0.5, 0.8]), torch.tensor([4.6, 2.0, 1.6])
+            >>> edges.box_offroad_distance(centre, torch.tensor(0.0), extent)
             tensor(0.5000)
         """
         extent = extent.expand(position.shape)
@@ -206,12 +209,13 @@ class RoadEdges:
         radius, half_z = boxes.half[:, :2].norm(dim=-1), boxes.half[:, 2]
         length = self.delta[:, :2].norm(dim=-1)
         slope = torch.where(length > 0, self.delta[:, 2].abs() / length, 0)
+        margin = _MARGIN * (1 + max(boxes.centre.abs().max(), self.start.abs().max()))
         parts = []
         for row, table, real in candidates.tables(boxes.parent):
             distance = self._stretched_distance(boxes.centre[row], table)
             rise = torch.minimum(slope[table] * radius[row, None], self.delta[:, 2].abs()[table])
             slack = torch.hypot(radius[row, None], HEIGHT_STRETCH * (half_z[row, None] + rise))
-            reach = (distance + slack).amin(1, keepdim=True) * (1 + _MARGIN) + _MARGIN
+            reach = (distance + slack).amin(1, keepdim=True) * (1 + _MARGIN) + margin
             keep = real & (distance - slack <= reach)
             parts.append((row, keep.sum(1), table[keep]))
         return Ragged.from_parts(len(boxes.parent), parts)
@@ -254,7 +258,7 @@ def _nested_boxes(points: Tensor) -> tuple[list[_Boxes], Tensor]:
 
 
 def _cell_key(points: Tensor, size: float) -> Tensor:
-    """One int64 for the cell of each point, ``[n, 3]`` -> ``[n]``; very far cells share a key, which costs only time."""
+    """One int64 for the cell of each point, ``[n, 3]`` -> ``[n]``; far cells share a key, which costs only time."""
     sides = torch.tensor([size, size, size / (2 * HEIGHT_STRETCH)], device=points.device)
     limit = 1 << 20
     x, y, z = (points / sides).floor().clamp(-limit, limit - 1).long().add_(limit).unbind(-1)

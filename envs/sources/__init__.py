@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from envs.sources.gpudrive import GPUDRIVE
 from envs.sources.source import Source, Unit
+from envs.sources.sumo import SUMO
 from envs.sources.womd import WOMD
 
-SOURCES: dict[str, Source] = {source.name: source for source in (WOMD, GPUDRIVE)}
+SOURCES: dict[str, Source] = {source.name: source for source in (WOMD, GPUDRIVE, SUMO)}
 """Every source that ``python -m envs.convert`` knows, by name."""
 
 __all__ = ["SOURCES", "Source", "Unit"]

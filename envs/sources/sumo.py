@@ -1,5 +1,8 @@
 """Unlimited multi-agent scenes from the traffic simulator SUMO; needs the extra ``sumo`` and no data at all.
 
+    python -m envs.convert sumo num_scenes=160,split=train scenes/train --workers 2 --shard-size 12
+    python -m envs.convert sumo num_scenes=24,split=test,max_agents=24 scenes/test --workers 2 --shard-size 12
+
 A unit of work is one random network with one random traffic on it: :func:`units` lists them, :func:`simulate` turns one
 into scenes, in any process. What a unit gives depends on its fields alone, so any number of workers gives the same
 scenes. The splits draw from ranges of unit numbers that never meet: no two share a network.
@@ -8,7 +11,8 @@ scenes. The splits draw from ranges of unit numbers that never meet: no two shar
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from importlib.resources import files
@@ -17,10 +21,11 @@ from pathlib import Path
 import yaml
 
 from envs.scene import LOG_STEPS, STEP_SECONDS, Scene, SceneError
+from envs.sources.source import Source, Unit
 from envs.sources.sumo_map import build_map
-from envs.sources.sumo_network import make_network
+from envs.sources.sumo_network import make_network, sumo_binary
 from envs.sources.sumo_scene import Crop, cut_scene, sdc_candidates
-from envs.sources.sumo_tracks import make_tracks
+from envs.sources.sumo_tracks import Tracks, make_tracks
 from envs.sources.sumo_traffic import simulate_traffic
 
 SPLITS = ("train", "tune", "test")
@@ -66,6 +71,20 @@ class SumoUnit:
     num_scenes: int
     options: SumoOptions
 
+    @property
+    def text(self) -> str:
+        """The unit in words, as a store notes where a scene came from; options only where they are not the default.
+
+        Examples:
+            >>> units(5, max_agents=24)[0].text
+            'preset=grid,number=0,num_scenes=5,max_agents=24'
+        """
+        default = make_options()
+        told = {"preset": self.preset, "number": self.number, "num_scenes": self.num_scenes}
+        names = [field.name for field in fields(SumoOptions)]
+        told |= {n: getattr(self.options, n) for n in names if getattr(self.options, n) != getattr(default, n)}
+        return ",".join(f"{name}={value}" for name, value in told.items())
+
 
 @cache
 def _settings() -> dict[str, dict]:
@@ -82,6 +101,12 @@ def presets() -> list[str]:
     return list(_settings()["presets"])
 
 
+def _known(what: str, unknown: Iterable[str], names: Iterable[str]) -> None:
+    """Refuse names that do not exist."""
+    for name in unknown:
+        raise ValueError(f"SUMO scenes have no {what} {name!r}; there are {', '.join(names)}.")
+
+
 def make_options(**overrides: float) -> SumoOptions:
     """The options of ``sumo.yaml``, some replaced.
 
@@ -93,9 +118,7 @@ def make_options(**overrides: float) -> SumoOptions:
         60.0
     """
     names = [field.name for field in fields(SumoOptions)]
-    unknown = sorted(set(overrides) - set(names))
-    if unknown:
-        raise ValueError(f"SUMO scenes have no option {unknown[0]!r}; there are {', '.join(names)}.")
+    _known("option", sorted(set(overrides) - set(names)), names)
     options = replace(SumoOptions(**_settings()["options"]), **overrides)
     for name in names:
         if name != "warmup" and getattr(options, name) <= 0:
@@ -122,20 +145,20 @@ def units(
         ValueError: an unknown split, preset or option, or a number out of range.
 
     Examples:
-        >>> [(unit.preset, unit.number, unit.num_scenes) for unit in units(45, seed=3)]
-        [('grid', 30000, 20), ('arterial', 30001, 20), ('town', 30002, 5)]
+        >>> [(unit.preset, unit.number, unit.num_scenes) for unit in units(30, seed=3)]
+        [('grid', 30000, 12), ('arterial', 30001, 12), ('town', 30002, 6)]
     """
     known = _settings()["presets"]
-    if preset not in known:
-        raise ValueError(f"There is no SUMO preset {preset!r}; there are {', '.join(known)}.")
-    if split not in SPLITS:
-        raise ValueError(f"There is no split {split!r}; there are {', '.join(SPLITS)}.")
+    _known("preset", {preset} - set(known), known)
+    _known("split", {split} - set(SPLITS), SPLITS)
     if not 0 <= seed < _SEEDS:
         raise ValueError(f"seed must lie in 0 ... {_SEEDS - 1}, got {seed}.")
     chosen = make_options(**options)
     per_unit = chosen.scenes_per_unit
     if not 0 < num_scenes <= _SEEDS * per_unit:
-        raise ValueError(f"num_scenes must lie in 1 ... {_SEEDS * per_unit}, got {num_scenes}; use another seed for more.")
+        raise ValueError(
+            f"num_scenes must lie in 1 ... {_SEEDS * per_unit}, got {num_scenes}; use another seed for more."
+        )
     cycle = known[preset] if isinstance(known[preset], list) else [preset]
     first = (SPLITS.index(split) * _SEEDS + seed) * _SEEDS
     return [
@@ -180,7 +203,7 @@ def simulate(unit: SumoUnit) -> list[Scene]:
     )
 
 
-def _turns(unit: SumoUnit, tracks: object) -> Iterator[tuple[int, int]]:
+def _turns(unit: SumoUnit, tracks: Tracks) -> Iterator[tuple[int, int]]:
     """Start step and SDC of every possible scene: one of each window in turn, the ones far apart first."""
     spacing = round(unit.options.window_spacing / STEP_SECONDS)
     starts = [window * spacing for window in range(unit.options.windows)]
@@ -207,3 +230,63 @@ def generate(
     """
     for unit in units(num_scenes, seed, split=split, preset=preset, **options):
         yield from simulate(unit)
+
+
+def parse(text: str) -> dict[str, object]:
+    """Words ``name=value,name=value`` -> arguments; numbers become numbers.
+
+    Raises:
+        ValueError: a word without a ``=``.
+
+    Examples:
+        >>> parse("num_scenes=160,split=train,radius=60.5")
+        {'num_scenes': 160, 'split': 'train', 'radius': 60.5}
+    """
+    words = [word.partition("=") for word in text.split(",")]
+    bad = [word[0] for word in words if not word[1]]
+    if bad:
+        raise ValueError(
+            f"{text!r}: {bad[0]!r} is not of the form name=value; write for example num_scenes=160,seed=0."
+        )
+    return {name.strip(): yaml.safe_load(value) for name, _, value in words}
+
+
+def _find(requests: Sequence[str]) -> list[str]:
+    """Requests of scenes (arguments of :func:`units`) -> one input for each simulation."""
+    sumo_binary("sumo")  # say now, not in a worker, that SUMO is missing
+    inputs = []
+    for request in requests:
+        try:
+            inputs += [unit.text for unit in units(**parse(request))]
+        except TypeError as error:
+            raise ValueError(f"{request!r}: {error}; say for example num_scenes=160,seed=0,split=train.") from error
+    return inputs
+
+
+def _read_unit(text: str) -> SumoUnit:
+    told = parse(text)
+    preset, number, num_scenes = (told.pop(name) for name in ("preset", "number", "num_scenes"))
+    return SumoUnit(preset, number, num_scenes, make_options(**told))
+
+
+@contextmanager
+def _open(text: str) -> Iterator[Callable[[Unit], Scene]]:
+    """A simulation that runs once, when its first scene is asked for."""
+    scenes: list[Scene] = []
+
+    def make(unit: Unit) -> Scene:
+        if not scenes:
+            scenes.extend(simulate(_read_unit(text)))
+        return scenes[unit.key]
+
+    yield make
+
+
+SUMO = Source(
+    name="sumo",
+    help="scenes simulated with SUMO; instead of files: num_scenes=160,seed=0,split=train,preset=mixed",
+    find=_find,
+    locate=lambda text: (Unit(text, i, i) for i in range(_read_unit(text).num_scenes)),
+    open=_open,
+)
+"""One input is one simulation; a shard size that is a multiple of ``scenes_per_unit`` runs each only once."""

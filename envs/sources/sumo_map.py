@@ -8,6 +8,7 @@ clockwise. Pavements lie outside, so a pedestrian on one is off-road in the log,
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -178,7 +179,7 @@ def _line_drafts(network: Network, drivable: object) -> list[Draft]:
     drafts, middle = [], []
     for edge in network.edges.values():
         lanes = [lane for lane in edge.lanes if lane.use != "foot"]
-        for right, left in zip(lanes, lanes[1:], strict=False):
+        for right, left in pairwise(lanes):
             kind = MapKind.LINE_BROKEN_WHITE if right.use == left.use else MapKind.LINE_SOLID_WHITE
             drafts.append((f"{right.lane_id}|", kind, _left_side(right), 0.0))
         border = shapely.LineString(_left_side(lanes[-1]))
@@ -228,6 +229,6 @@ def _links(network: Network, number: dict[str, int]) -> list[tuple[int, int, int
     for edge in network.edges.values():
         for use in ("vehicle", "bike"):
             lanes = [number[lane.lane_id] for lane in edge.lanes_for(use)]
-            for right, left in zip(lanes, lanes[1:], strict=False):
+            for right, left in pairwise(lanes):
                 links += [(right, left, LinkKind.LEFT), (left, right, LinkKind.RIGHT)]
     return links

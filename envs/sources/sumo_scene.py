@@ -137,7 +137,8 @@ def _nearest_rows(tracks: Tracks, sdc: int, now: int, crop: Crop) -> np.ndarray:
 def _cut_agents(tracks: Tracks, rows: np.ndarray, window: slice, origin: np.ndarray, max_predict: int) -> Agents:
     valid = tracks.valid[rows, window]
     flat = (tracks.centre[rows, window] - origin) * valid[..., None]
-    position = np.concatenate((flat, np.zeros_like(flat[..., :1])), -1)
+    height = np.broadcast_to(tracks.extent[rows, None, 2:] / 2, flat[..., :1].shape)  # boxes stand on z = 0
+    position = np.concatenate((flat, height * valid[..., None]), -1)
     heading = (tracks.heading[rows, window] + np.pi) % (2 * np.pi) - np.pi
     predict = np.zeros(len(rows), dtype=bool)
     predict[_rows_to_predict(tracks, rows, window, max_predict)] = True
@@ -171,7 +172,7 @@ def _wheels_collide(agents: Agents) -> bool:
     size = agents.extent[:, None, :2].expand(-1, LOG_STEPS, -1)
     boxes = torch.cat((agents.position[..., :2], agents.heading[..., None], size), -1).transpose(0, 1)
     ego = (agents.kind != AgentKind.PEDESTRIAN).nonzero()[:, 0]
-    return bool((nearest_box_distance(boxes, agents.valid.T, ego=ego) < 0).any())
+    return bool((nearest_box_distance(boxes, agents.valid.T, ego=ego, rounding=0.0) < 0).any())
 
 
 def _kept_region(tracks: Tracks, rows: np.ndarray, window: slice, origin: np.ndarray, crop: Crop) -> object:

@@ -288,9 +288,10 @@ def _read_lights(path: Path, first: int, steps: int) -> dict[str, list[str]]:
 
 def _read_tracks(path: Path, first: int, steps: int) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of the trips that were seen ``[V]``, and their x, y, angle and speed ``[V, T, 4]`` (NaN where absent)."""
-    columns = {name: i for i, name in enumerate(path.open(encoding="utf-8").readline().strip().split(";"))}
     wanted = ("timestep_time", "vehicle_id", "vehicle_x", "vehicle_y", "vehicle_angle", "vehicle_speed")
-    table = np.loadtxt(path, delimiter=";", skiprows=1, usecols=[columns[name] for name in wanted], ndmin=2)
+    with path.open(encoding="utf-8") as file:
+        columns = {name: i for i, name in enumerate(file.readline().strip().split(";"))}
+        table = np.loadtxt(file, delimiter=";", usecols=[columns[name] for name in wanted], ndmin=2)
     step = np.rint(table[:, 0] / STEP_SECONDS).astype(np.int64) - first
     table, step = (rows[(step >= 0) & (step < steps)] for rows in (table, step))
     numbers, row = np.unique(table[:, 1].astype(np.int64), return_inverse=True)

@@ -103,7 +103,7 @@ def test_an_absent_agent_is_not_drawn() -> None:
     here, gone = (render_frame(scene, step=s, view=view, trails=False, pixels=PIXELS) for s in (49, 50))
     legend = slice(0, 100)  # has a swatch of the class, drawn or not
     here[legend], gone[legend] = 0, 0
-    assert shown(here, blue).sum() > 100
+    assert shown(here, blue).sum() > 50
     assert not shown(gone, blue).any()
 
 
@@ -148,6 +148,17 @@ def test_pictures_are_written_whole_as_png_and_gif(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=name):
             save_picture(tmp_path / name, refused)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["all.gif", "one.png"]
+
+
+def test_a_gif_keeps_the_colour_of_a_class_that_is_a_few_pixels_large(tmp_path: Path) -> None:
+    scene = straight_road(num_vehicles=3)
+    scene.agents.kind[1:] = torch.tensor([AgentKind.PEDESTRIAN, AgentKind.CYCLIST])
+    scene.agents.extent[1:] = torch.tensor([2.0, 1.0, 1.7])
+    save_picture(tmp_path / "x.gif", render_frames(scene, steps=[10, 11], view=HERE, pixels=PIXELS))
+    with Image.open(tmp_path / "x.gif") as gif:
+        picture = np.asarray(gif.convert("RGB"))
+    for x, kind in ((-15, AgentKind.PEDESTRIAN), (-30, AgentKind.CYCLIST)):
+        assert shown(picture, style.AGENT_COLORS[kind])[pixel(x - 0.5, -2.5)], kind
 
 
 class FakeStore:

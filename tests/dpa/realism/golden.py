@@ -31,9 +31,13 @@ class Golden:
     scene: str
     kind: str
 
-    def load_scene(self) -> Scene:
-        """The scene in a frame whose origin is whole metres, so that no float32 value of the official code changes."""
-        return scene_from_npz(np.load(self.folder / "scenarios" / f"{self.scene}.npz"))
+    def load_scene(self, *, moved: bool = False) -> Scene:
+        """The scene in the frame of its source, or in one whose origin is near and whole metres.
+
+        Whole metres change no float32 value of a scene that lies kilometres from the origin of its source. The
+        synthetic scenes lie around it and have values near zero, which would be rounded.
+        """
+        return scene_from_npz(dict(np.load(self.folder / "scenarios" / f"{self.scene}.npz")), moved=moved)
 
     def load_rollouts(self, scene: Scene) -> Tensor:
         """``[R, A, 80, 4]`` in the frame and the order of the scene."""
@@ -52,12 +56,12 @@ class Golden:
         return json.loads(path.read_text(encoding="utf-8"))
 
 
-def scene_from_npz(data: Any) -> Scene:
+def scene_from_npz(data: dict[str, np.ndarray], *, moved: bool) -> Scene:
     """A scene from the golden arrays."""
     world = torch.from_numpy(np.stack([data["x"], data["y"], data["z"]], -1)).float()
     valid = torch.from_numpy(data["valid"])
     sdc = int(data["sdc_track_index"])
-    origin = torch.zeros(3,dtype=torch.float64)
+    origin = world[sdc, CURRENT_STEP].double().round() * moved
     num = len(world)
     first = valid.int().argmax(1)
     step = torch.where(valid[:, CURRENT_STEP], CURRENT_STEP, first)
@@ -84,7 +88,7 @@ def scene_from_npz(data: Any) -> Scene:
     )
 
 
-def _road(data: Any, origin: Tensor) -> RoadMap:
+def _road(data: dict[str, np.ndarray], origin: Tensor) -> RoadMap:
     points, counts, kinds, ids = [], [], [], []
     for part, first_kind in (("lane", MapKind.LANE_UNDEFINED), ("road_edge", MapKind.EDGE_UNKNOWN)):
         points.append(torch.from_numpy(data[f"{part}_xyz"]).float() - origin.float())
@@ -104,7 +108,7 @@ def _road(data: Any, origin: Tensor) -> RoadMap:
     )
 
 
-def lights_from_npz(data: Any, origin: Tensor) -> Lights:
+def lights_from_npz(data: dict[str, np.ndarray], origin: Tensor) -> Lights:
     """Lights by lane; where a step lists a lane twice, the later entry wins."""
     lane_id = torch.unique(torch.from_numpy(data["tl_lane_id"]).long())
     state = torch.full((len(lane_id), LOG_STEPS), int(LightState.ABSENT))

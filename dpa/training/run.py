@@ -1,0 +1,91 @@
+"""One training run in one folder: resumes by itself, shows its progress, keeps its curves and checkpoints."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from dpa.training.checkpoint import Checkpointer, Stateful, capture, restore
+from dpa.training.loggers import Backend, make_logger
+from dpa.training.progress import progress
+
+
+class Run:
+    """The frame of a training loop that the recipe itself writes.
+
+    Args:
+        folder: of the run; checkpoints and curves live here.
+        parts: what training changes: network, optimiser, schedule.
+
+    Keyword Args:
+        config: all that decides the run, compared on resume.
+        total_steps: updates of the whole run.
+        checkpoint_interval: updates between two checkpoints: what a kill can cost at most.
+        backend: where curves go beside CSV.
+        description: of the progress bar.
+
+    Examples:
+        >>> import tempfile
+        >>> import torch
+        >>> net = torch.nn.Linear(1, 1)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with Run(folder, {"net": net}, config={}, total_steps=3, checkpoint_interval=2) as run:
+        ...         for step in run.steps():
+        ...             run.log({"train/loss": step})
+        ...     with Run(folder, {"net": net}, config={}, total_steps=3, checkpoint_interval=2) as again:
+        ...         list(again.steps())  # nothing is left to do
+        []
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        parts: Mapping[str, Stateful],
+        *,
+        config: Mapping[str, Any],
+        total_steps: int,
+        checkpoint_interval: int,
+        backend: Backend = "csv",
+        description: str = "train",
+    ) -> None:
+        if checkpoint_interval < 1:
+            raise ValueError(f"checkpoint_interval must be positive, got {checkpoint_interval}.")
+        self.folder, self.parts = Path(folder), parts
+        self.total_steps, self.checkpoint_interval = total_steps, checkpoint_interval
+        self.description = description
+        self.state: dict[str, Any] = {}
+        """Plain values that are kept in every checkpoint, for the recipe's own use."""
+        self._checkpoints = Checkpointer(self.folder / "checkpoints", config=config)
+        saved = self._checkpoints.latest()
+        if saved is not None:
+            restore(saved, parts)
+            self.state = dict(saved["progress"])
+        self.first_step = 0 if saved is None else saved["step"]
+        self._logger = make_logger(backend, self.folder, config, resume_step=saved and saved["step"])
+        self._step = self.first_step
+
+    def steps(self) -> Iterator[int]:
+        """Steps that are left, counted from 0; saves a checkpoint after every interval and after the last one."""
+        start = time.perf_counter()
+        bar = progress(total=self.total_steps, description=self.description, initial=self.first_step, unit="step")
+        with bar:
+            for step in range(self.first_step, self.total_steps):
+                self._step = step + 1
+                yield step
+                bar.update()
+                done = step + 1
+                if done % self.checkpoint_interval == 0 or done == self.total_steps:
+                    self.log({"time/seconds_per_step": (time.perf_counter() - start) / (done - self.first_step)})
+                    self._checkpoints.save(done, capture(self.parts, progress=self.state))
+
+    def log(self, metrics: Mapping[str, Any]) -> None:
+        """Write numbers for the step at hand, as ``"<group>/<name>"``."""
+        self._logger.log(metrics, self._step)
+
+    def __enter__(self) -> Run:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._logger.close()

@@ -1,0 +1,133 @@
+"""Align a policy with the preferences among its own rollouts (METHOD sections 5 and 6).
+
+    python -m recipes.align method=dpa_omf policy=runs/pretrain/policy.pt preferences=runs/preferences
+
+Methods differ in one YAML each: dpa_omf, dpa_adef, sft_best_oa, sft_best_ade, adversarial_afd. Run the same command again to
+go on after a kill.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import hydra
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDict
+from torchrl.objectives import LossModule
+
+from dpa.losses import ContrastivePreferenceLoss, NextTokenLoss, token_network
+from dpa.policy import MotionLM
+from dpa.preferences import PreferenceStore
+from dpa.training.batches import Item, ShuffledOrder, collate_items
+from dpa.training.optim import clip_and_step, make_optimizer, make_schedule
+from dpa.training.run import Run
+from dpa.training.seeding import make_generator, seed_everything
+from envs import keys
+from envs.store import SceneStore
+from recipes.candidates import Candidates, make_candidates
+from recipes.cli import CONFIG, build, plain, recipe
+from recipes.models import open_policy, weights_digest, write_policy
+from recipes.scenes import fingerprint, open_splits
+
+LOSSES: dict[str, type[LossModule]] = {"contrastive": ContrastivePreferenceLoss, "next_token": NextTokenLoss}
+"""Losses that a method's YAML can name."""
+
+
+def align(
+    cfg: DictConfig, method: DictConfig, scenes: SceneStore, policy: Path, preferences: Path, seed: int, folder: Path
+) -> Path:
+    """Fine-tune a policy with one method.
+
+    Args:
+        cfg: with the sections ``alignment``, ``logger``, ``device``.
+        method: ``name``, ``data`` and ``loss``, from ``config/method``.
+        scenes: that the preferences are of.
+        policy: file of the reference policy.
+        preferences: folder of the store that :mod:`recipes.collect` made with the reference.
+        seed: of batches and dropout.
+        folder: of the run.
+
+    Returns:
+        The file of the aligned policy.
+
+    Raises:
+        ValueError: preferences of other scenes, an unknown loss, or options that do not fit it.
+    """
+    options, path = cfg.alignment, folder / "policy.pt"
+    model, context, config = open_policy(policy, cfg.device)
+    store = PreferenceStore(preferences)
+    if store.provenance.scenes != fingerprint(scenes):
+        raise ValueError(f"{preferences} ranks rollouts of other scenes; collect again with the scenes at hand.")
+    decided_by = {
+        "method": plain(method),
+        "alignment": plain(options),
+        "seed": seed,
+        "reference": weights_digest(model),
+        "preferences": store.provenance.policy,
+    }
+    seed_everything(seed)
+    candidates = make_candidates(method.data, store, scenes, context, model.tokenizer.cpu(), seed)
+    loss = make_loss(method.loss, model.to(cfg.device).train())
+    optimizer = make_optimizer(model, options.lr, options.weight_decay)
+    schedule = make_schedule(optimizer, options.steps, options.warmup)
+    order = ShuffledOrder(len(candidates), options.scenes_per_step, seed)
+    run = Run(
+        folder,
+        {"policy": model, "optimizer": optimizer, "schedule": schedule},
+        config=decided_by,
+        total_steps=options.steps,
+        checkpoint_interval=options.checkpoint_interval,
+        backend=cfg.logger.backend,
+        description=method.name,
+    )
+    with run:
+        for step in run.steps():
+            draw = make_generator(seed, "pairs", step)
+            batch = make_batch(candidates, order(step), options.pairs_per_scene, draw).to(cfg.device)
+            losses = loss(batch)
+            sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+            norm = clip_and_step(optimizer, options.max_norm, schedule)
+            run.log({f"train/{key}": value.detach() for key, value in losses.items()} | {"train/gradient_norm": norm})
+    write_policy(path, model, config, {"method": method.name, "seed": seed, "options": decided_by})
+    return path
+
+
+def make_loss(section: DictConfig, model: MotionLM) -> LossModule:
+    """The loss that a method names, around the model; a reference copy is the model as it is now."""
+    options = {key: value for key, value in section.items() if key != "kind"}
+    if section.kind not in LOSSES:
+        raise ValueError(f"method.loss.kind must be one of {sorted(LOSSES)}, got {section.kind!r}.")
+    return build(LOSSES[section.kind], DictConfig(options), f"method.loss ({section.kind})", token_network(model))
+
+
+def make_batch(candidates: Candidates, indices: list[int], num: int, draw: torch.Generator) -> TensorDict:
+    """A batch of ``num`` pairs (or targets) of each of some scenes.
+
+    Pairs become ``preferred`` and ``unpreferred``, targets ``tokens``; a method has the one or the other.
+    """
+    sides: list[list[Item]] = [[], []]
+    for index in indices:
+        group = candidates[index]
+        chosen = torch.randperm(len(group.preferred), generator=draw)[:num]
+        for side, tokens in zip(sides, (group.preferred, group.unpreferred), strict=True):
+            if tokens is not None:
+                side.append(Item(group.context, tokens[chosen], group.token_valid))
+    batch = collate_items(sides[0])
+    if sides[1]:
+        batch[keys.UNPREFERRED] = collate_items(sides[1])[keys.TOKENS]
+        batch.rename_key_(keys.TOKENS, keys.PREFERRED)
+    return batch
+
+
+@hydra.main(**CONFIG, config_name="align")
+@recipe
+def main(cfg: DictConfig) -> None:
+    """Entry point of ``python -m recipes.align``."""
+    scenes = open_splits(cfg.scenes).train
+    path = align(cfg, cfg.method, scenes, Path(cfg.policy), Path(cfg.preferences), cfg.seed, Path(cfg.output))
+    print(f"policy: {path}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,88 @@
+"""What every recipe's ``main`` shares: options from YAML, and one clear error instead of a traceback."""
+
+from __future__ import annotations
+
+import functools
+import json
+import sys
+import warnings
+from collections.abc import Callable
+from inspect import Parameter, signature
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+CONFIG = {"version_base": "1.3", "config_path": "config"}
+"""Arguments of ``hydra.main`` that all recipes share."""
+USER_ERRORS = (ValueError, OSError, ImportError, FloatingPointError, HydraException, OmegaConfBaseException)
+
+
+def recipe(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
+    """Run a recipe; what a user can mend ends in one line on stderr and exit status 2."""
+
+    @functools.wraps(main)
+    def run(cfg: DictConfig) -> None:
+        warnings.filterwarnings("ignore", category=DeprecationWarning, module="torchrl")
+        torch.set_num_threads(cfg.threads)
+        try:
+            main(cfg)
+        except USER_ERRORS as error:
+            print(f"error: {error}", file=sys.stderr)
+            sys.exit(2)
+
+    return run
+
+
+def plain(section: DictConfig) -> dict[str, Any]:
+    """A section of the configuration as plain dicts and lists, interpolations resolved."""
+    return OmegaConf.to_container(section, resolve=True, throw_on_missing=True)
+
+
+def build(target: Callable[..., Any], section: DictConfig, name: str, *args: Any, **fixed: Any) -> Any:
+    """Call ``target`` with a section of the configuration as keyword arguments.
+
+    Raises:
+        ValueError: a key that the target does not take, or one that it lacks; the message names both.
+    """
+    options = plain(section)
+    parameters = signature(target).parameters.values()
+    known = [p.name for p in parameters if p.kind in (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)]
+    unknown = sorted(set(options) - set(known))
+    if unknown:
+        raise ValueError(f"{name} has no option {unknown[0]!r}; it takes {', '.join(known)}.")
+    return target(*args, **options, **fixed)
+
+
+def write_json(path: str | Path, content: Any) -> None:
+    """Write JSON whole or not at all; a NaN is an error."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    part.replace(path)
+
+
+def finished(path: Path, decided_by: dict[str, Any]) -> dict[str, Any] | None:
+    """The content of a result that an earlier run with the same options wrote, or ``None``.
+
+    Args:
+        path: JSON with an entry ``"options"``.
+        decided_by: the options of this run.
+
+    Raises:
+        ValueError: the result is of other options.
+    """
+    if not path.is_file():
+        return None
+    content = json.loads(path.read_text(encoding="utf-8"))
+    now = json.loads(json.dumps(decided_by))
+    if content["options"] != now:
+        differ = sorted(k for k in now | content["options"] if now.get(k) != content["options"].get(k))
+        raise ValueError(
+            f"{path} was written with other options ({', '.join(differ)}); name another output folder, or remove it."
+        )
+    return content

@@ -1,0 +1,81 @@
+"""Roll a policy out, rank its rollouts against the log, and keep them as preferences (METHOD sections 3 and 4).
+
+    python -m recipes.collect policy=runs/pretrain/policy.pt
+    python -m dpa.preferences info runs/preferences
+
+Run the same command again to go on after a kill.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
+
+from dpa.preferences import PreferenceStore, PreferenceWriter, Provenance
+from dpa.ranking import PreferenceDistance
+from dpa.ranking.transform import RankRollouts
+from dpa.rollout import Decoding, collect_groups
+from dpa.training.progress import progress
+from envs.store import SceneStore
+from recipes.cli import CONFIG, build, plain, recipe
+from recipes.models import open_policy, weights_digest
+from recipes.scenes import fingerprint, open_splits
+
+
+def collect(cfg: DictConfig, scenes: SceneStore, policy: Path, seed: int, folder: Path) -> PreferenceStore:
+    """Fill a preference store with ranked rollouts of every scene that it lacks.
+
+    Args:
+        cfg: with the sections ``collection`` and ``device``.
+        scenes: to roll out.
+        policy: file of the policy.
+        seed: of the sampling.
+        folder: of the store.
+    """
+    options = cfg.collection
+    model, context, _ = open_policy(policy, cfg.device)
+    distance = build(PreferenceDistance, options.ranking, "collection.ranking")
+    provenance = Provenance(
+        policy=weights_digest(model),
+        scenes=fingerprint(scenes),
+        ranking=distance.describe(),
+        sampling=plain(options.decoding),
+        seed=seed,
+        num_rollouts=options.num_rollouts,
+        horizon=context.horizon,
+        vocab_size=model.tokenizer.vocab_size,
+    )
+    with PreferenceWriter(folder, provenance, chunk_scenes=options.chunk_scenes) as writer:
+        left = [index for index in range(len(scenes)) if index not in writer.scenes_done]
+        bar = progress(total=len(scenes), description="collect", initial=len(scenes) - len(left), unit="scene")
+        with bar:
+            for groups in collect_groups(
+                scenes,
+                model,
+                left,
+                num_rollouts=options.num_rollouts,
+                decoding=build(Decoding, options.decoding, "collection.decoding"),
+                options=context,
+                seed=seed,
+                make_postproc=lambda part: RankRollouts(part, options.num_rollouts, distance),
+                max_rows=options.max_rows,
+                device=cfg.device,
+            ):
+                writer.append(groups)
+                bar.update(len(groups))
+    return PreferenceStore(folder)
+
+
+@hydra.main(**CONFIG, config_name="collect")
+@recipe
+def main(cfg: DictConfig) -> None:
+    """Entry point of ``python -m recipes.collect``."""
+    scenes = getattr(open_splits(cfg.scenes), cfg.split)
+    store = collect(cfg, scenes, Path(cfg.policy), cfg.seed, Path(cfg.output))
+    print(f"preferences of {len(store)} scenes: {cfg.output}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,68 @@
+"""Policies of the recipes: built from the configuration, saved and opened as one self-describing file."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+
+from dpa.policy import SIZES, ContextOptions, MotionLM, MotionLMConfig
+from dpa.tokens import VerletTokenizer
+from dpa.training.checkpoint import load_policy, load_weights, save_policy
+from recipes.cli import build, plain
+
+TOKENIZERS = {"verlet": VerletTokenizer}
+"""Tokenizers that a YAML can name; add a class of your own here (docs/how-to.md)."""
+
+
+def context_options(cfg: DictConfig) -> ContextOptions:
+    """How scenes are cut up, from ``cfg.model.context``."""
+    return build(ContextOptions, cfg.context, "model.context")
+
+
+def policy_config(cfg: DictConfig) -> dict[str, Any]:
+    """Everything that decides a policy's shape, from ``cfg.model``: what a checkpoint is compared with."""
+    if cfg.size not in SIZES:
+        raise ValueError(f"model.size must be one of {sorted(SIZES)}, got {cfg.size!r}.")
+    if cfg.tokenizer.name not in TOKENIZERS:
+        raise ValueError(f"model.tokenizer.name must be one of {sorted(TOKENIZERS)}, got {cfg.tokenizer.name!r}.")
+    context = context_options(cfg)
+    size = SIZES[cfg.size].as_dict() | {"horizon": context.horizon, "dropout": cfg.dropout}
+    return {"model": size, "tokenizer": plain(cfg.tokenizer), "context": asdict(context)}
+
+
+def build_policy(config: dict[str, Any]) -> MotionLM:
+    """A fresh policy from :func:`policy_config`."""
+    tokenizer = dict(config["tokenizer"])
+    return MotionLM(MotionLMConfig(**config["model"]), TOKENIZERS[tokenizer.pop("name")](**tokenizer))
+
+
+def write_policy(path: Path, model: MotionLM, config: dict[str, Any], metadata: dict[str, Any]) -> None:
+    """Save a policy with what it is and where it comes from."""
+    save_policy(path, model.state_dict(), config, metadata)
+
+
+def open_policy(path: str | Path, device: str = "cpu") -> tuple[MotionLM, ContextOptions, dict[str, Any]]:
+    """A saved policy, its context options and its configuration.
+
+    Raises:
+        FileNotFoundError: no such file.
+        CheckpointError: the file is damaged or no policy.
+    """
+    weights, config, _ = load_policy(path)
+    model = build_policy(config)
+    load_weights(model, weights, config, config, where=str(path))
+    return model.to(device).eval(), ContextOptions(**config["context"]), config
+
+
+def weights_digest(model: torch.nn.Module) -> str:
+    """Digest of a policy's parameters."""
+    digest = hashlib.sha256()
+    for name, value in sorted(model.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]

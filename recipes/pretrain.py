@@ -1,0 +1,127 @@
+"""Pre-train a MotionLM by next-token prediction on logged traffic (METHOD eq. 1).
+
+    python -m recipes.pretrain                                   # SUMO scenes, made on the spot
+    python -m recipes.pretrain scenes=gpudrive scenes.train=DIR scenes.eval=DIR output=runs/reference
+
+The weights that are best on the tuning scenes become ``policy.pt``. Run the same command again to go on after a kill.
+"""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import hydra
+import torch
+from omegaconf import DictConfig
+
+from dpa.losses import NextTokenLoss, token_network
+from dpa.policy import MotionLM, make_context
+from dpa.training.batches import Item, ShuffledOrder, collate_items, crop_agents, log_item
+from dpa.training.optim import clip_and_step, make_optimizer, make_schedule
+from dpa.training.progress import progress
+from dpa.training.run import Run
+from dpa.training.seeding import make_generator, seed_everything
+from envs.augment import mirror
+from envs.scene import SceneSource
+from recipes.cli import CONFIG, plain, recipe
+from recipes.models import build_policy, context_options, policy_config, write_policy
+from recipes.scenes import Splits, fingerprint, open_splits
+
+
+def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path) -> Path:
+    """Train one reference policy.
+
+    Args:
+        cfg: with the sections ``model``, ``pretraining``, ``logger``, ``device``.
+        splits: scenes.
+        seed: of everything that draws.
+        folder: of the run.
+
+    Returns:
+        The file of the policy.
+    """
+    path, options = folder / "policy.pt", cfg.pretraining
+    config = policy_config(cfg.model)
+    decided_by = {"policy": config, "pretraining": plain(options), "seed": seed, "scenes": fingerprint(splits.train)}
+    seed_everything(seed)
+    model = build_policy(config).to(cfg.device)
+    best = copy.deepcopy(model)
+    train = log_items(splits.train, cfg, model, mirrored=options.mirror, name="tokens of train scenes")
+    tune = log_items(splits.tune, cfg, model, mirrored=False, name="tokens of tune scenes")
+    loss = NextTokenLoss(token_network(model), label_smoothing=options.label_smoothing)
+    optimizer = make_optimizer(model, options.lr, options.weight_decay)
+    schedule = make_schedule(optimizer, options.steps, options.warmup)
+    order = ShuffledOrder(len(train), options.batch_size, seed)
+    run = Run(
+        folder,
+        {"policy": model, "best": best, "optimizer": optimizer, "schedule": schedule},
+        config=decided_by,
+        total_steps=options.steps,
+        checkpoint_interval=options.checkpoint_interval,
+        backend=cfg.logger.backend,
+        description="pretrain",
+    )
+    run.state.setdefault("best_nll", float("inf"))
+    with run:
+        for step in run.steps():
+            crop = make_generator(seed, "crop", step)
+            batch = collate_items([crop_agents(train[i], options.max_agents, crop) for i in order(step)])
+            losses = loss(batch.to(cfg.device))
+            losses["loss_next_token"].backward()
+            norm = clip_and_step(optimizer, options.max_norm, schedule)
+            run.log({f"train/{key}": value for key, value in losses.items()} | {"train/gradient_norm": norm})
+            if (step + 1) % options.tune_interval == 0 or step + 1 == options.steps:
+                measured = negative_log_likelihood(model, tune, options.max_agents, cfg.device)
+                run.log({f"tune/{key}": value for key, value in measured.items()})
+                if measured["nll"] < run.state["best_nll"]:
+                    run.state["best_nll"] = measured["nll"]
+                    best.load_state_dict(model.state_dict())
+    write_policy(path, best, config, {"method": "reference", "seed": seed, "tune_nll": run.state["best_nll"]})
+    return path
+
+
+def log_items(scenes: SceneSource, cfg: DictConfig, model: MotionLM, *, mirrored: bool, name: str) -> list[Item]:
+    """Tokenized logs of all scenes, and of their mirror images."""
+    options, tokenizer = context_options(cfg.model), copy.deepcopy(model.tokenizer).cpu()
+    items = []
+    for index in progress(range(len(scenes)), name, unit="scene"):
+        scene = scenes[index]
+        items += [
+            log_item(make_context(s, options), tokenizer) for s in ([scene, mirror(scene)] if mirrored else [scene])
+        ]
+    return [item for item in items if item.token_valid.any()]
+
+
+@torch.no_grad()
+def negative_log_likelihood(model: MotionLM, items: list[Item], max_agents: int, device: str) -> dict[str, float]:
+    """Per valid token [nats]: ``nll`` of all agents and ``nll_moving`` of those whose velocity changes at all.
+
+    A standing agent repeats one token and is easy; it would hide how moving agents are predicted.
+    """
+    model.eval()
+    totals = torch.zeros(2, 2, dtype=torch.float64)
+    for index, item in enumerate(items):
+        batch = collate_items([crop_agents(item, max_agents, make_generator(0, "tune", index))]).to(device)
+        tokens, valid = batch["tokens"], batch["token_valid"]
+        logits = model(batch["context"], tokens, valid)
+        nll = -logits.log_softmax(-1).gather(-1, tokens[..., None])[..., 0].cpu()
+        valid, tokens = valid.cpu(), tokens.cpu()
+        changes = ((tokens != tokens[..., :1]) & valid).any(-1, keepdim=True)
+        for row, mask in enumerate((valid, valid & changes)):
+            totals[row] += torch.tensor([nll[mask].sum(), mask.sum()], dtype=torch.float64)
+    model.train()
+    every, moving = (totals[:, 0] / totals[:, 1].clamp(min=1)).tolist()
+    return {"nll": every, "nll_moving": moving}
+
+
+@hydra.main(**CONFIG, config_name="pretrain")
+@recipe
+def main(cfg: DictConfig) -> None:
+    """Entry point of ``python -m recipes.pretrain``."""
+    path = pretrain(cfg, open_splits(cfg.scenes), cfg.seed, Path(cfg.output))
+    print(f"policy: {path}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,71 @@
+"""Scenes of a recipe: raw files are converted once, then split into train, tune and eval."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig, ListConfig
+
+from dpa.training.seeding import make_generator
+from envs.convert import convert
+from envs.store import SceneStore
+
+
+@dataclass(frozen=True)
+class Splits:
+    """Scenes to train on, to choose checkpoints and decoding on, and to evaluate on (never to tune on).
+
+    Attributes:
+        train: scenes that losses see.
+        tune: a part of the training files that no loss sees.
+        eval: scenes of files of their own.
+    """
+
+    train: SceneStore
+    tune: SceneStore
+    eval: SceneStore
+
+    def sizes(self) -> dict[str, int]:
+        """Number of scenes of each split."""
+        return {"train": len(self.train), "tune": len(self.tune), "eval": len(self.eval)}
+
+
+def open_splits(cfg: DictConfig) -> Splits:
+    """Open the splits that ``cfg.scenes`` describes, converting what is not converted yet.
+
+    ``train`` and ``eval`` are what :func:`envs.convert.convert` takes for the source, or folders of stores for the
+    source ``store``. ``tune`` scenes are drawn from the training scenes with ``split_seed``.
+
+    Raises:
+        ValueError: fewer training scenes than ``tune`` asks for, or scenes that are both trained and evaluated on.
+    """
+    pool, held_out = (_open(cfg, cfg[split]) for split in ("train", "eval"))
+    shared = sorted(set(pool.scene_ids) & set(held_out.scene_ids))
+    if shared:
+        raise ValueError(f"scenes.train and scenes.eval share {len(shared)} scenes (the first is {shared[0]!r}).")
+    if not 0 < cfg.tune < len(pool):
+        raise ValueError(f"scenes.tune must lie between 1 and the {len(pool) - 1} training scenes, got {cfg.tune}.")
+    order = torch.randperm(len(pool), generator=make_generator(cfg.split_seed, "tune")).tolist()
+    tune, train = sorted(order[: cfg.tune]), sorted(order[cfg.tune :])
+    if cfg.limit is not None:
+        train, held_out = train[: cfg.limit], held_out.subset(range(min(cfg.limit, len(held_out))))
+    return Splits(pool.subset(train), pool.subset(tune), held_out)
+
+
+def fingerprint(scenes: SceneStore) -> str:
+    """Digest of the scenes' ids in order: an index means nothing without it."""
+    return hashlib.sha256("\n".join(scenes.scene_ids).encode()).hexdigest()[:16]
+
+
+def _open(cfg: DictConfig, paths: str | ListConfig) -> SceneStore:
+    inputs = [paths] if isinstance(paths, str) else list(paths)
+    if cfg.source == "store":
+        if len(inputs) != 1:
+            raise ValueError(f"scenes.source=store takes one folder for each split, got {inputs}.")
+        return SceneStore(inputs[0])
+    name = hashlib.sha256("\n".join([cfg.source, *inputs]).encode()).hexdigest()[:12]
+    folder = Path(cfg.cache) / f"{cfg.source}_{name}"
+    return convert(cfg.source, inputs, folder, workers=cfg.workers, progress=True)

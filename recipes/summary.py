@@ -1,0 +1,175 @@
+"""From the results of all runs to ``comparison.json``, figures and the page."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from dpa.report.figures import plot_comparison, plot_curves, plot_scenes, read_curves
+from dpa.report.page import Picture, write_page
+from dpa.report.player import PlayerScene
+from dpa.report.statistics import compare_methods
+from dpa.report.table import REFERENCE
+from dpa.rollout import Decoding, collect_groups, simulated_poses
+from envs import keys
+from recipes.cli import plain, write_json
+from recipes.models import open_policy
+from recipes.scenes import Splits
+
+FIGURES = (
+    "kinematic",
+    "interactive",
+    "map_based",
+    "realism",
+    "min_ade",
+    "collision_rate",
+    "offroad_rate",
+    "preference_distance",
+    "standing_moved",
+)
+CURVES = (
+    "train/nll_preferred",
+    "train/nll_unpreferred",
+    "train/pair_accuracy",
+    "train/logit_std",
+    "train/kl",
+    "train/entropy",
+)
+"""Scalars that are drawn (METHOD figures 4 and 6, PRIOR point 2)."""
+PLAYED_ROLLOUTS = 4
+PACKAGES = ("torch", "torchrl", "tensordict", "pot", "numpy", "dpa-omf")
+
+
+def summarise_comparison(
+    cfg: DictConfig,
+    splits: Splits,
+    best: dict[str, float],
+    stages: dict[str, float],
+    result_of: Callable[[int, str, str, float], Path],
+) -> dict[str, Any]:
+    """The content of ``comparison.json``.
+
+    Rows at the common top-p come first, then those of methods whose own best top-p is another one. A paired entry compares
+    like with like: common with common, and own best with the reference's own best.
+    """
+    common, methods = cfg.decoding.common, [REFERENCE, *cfg.methods]
+    at = [(method, common) for method in methods] + [(m, best[m]) for m in methods if best[m] != common]
+    results = {
+        (method, top_p, seed): json.loads(result_of(seed, method, "eval", top_p).read_text(encoding="utf-8"))
+        for method, top_p in {*at, *((m, best[m]) for m in methods)}
+        for seed in cfg.seeds
+    }
+
+    def realism(method: str, top_p: float) -> dict[str, list[float]]:
+        return {str(seed): results[method, top_p, seed]["per_scene"]["realism"] for seed in cfg.seeds}
+
+    rows = [
+        {
+            "method": method,
+            "seed": seed,
+            "top_p": top_p,
+            **{name: results[method, top_p, seed]["mean"][name] for name in FIGURES},
+            "pair_accuracy": _pair_accuracy(result_of(seed, method, "eval", top_p).parent),
+            "n_scenes": len(results[method, top_p, seed]["scenes"]),
+        }
+        for method, top_p in at
+        for seed in cfg.seeds
+    ]
+    paired = [
+        {**entry, "top_p": common, "against": common}
+        for entry in compare_methods({m: realism(m, common) for m in methods}, REFERENCE)
+    ]
+    own = [m for m in methods if m != REFERENCE]
+    best_paired = [
+        {**entry, "top_p": best[entry["method"]], "against": best[REFERENCE]}
+        for entry in compare_methods({m: realism(m, best[m]) for m in (REFERENCE, *own)}, REFERENCE)
+    ]
+    sharper = []
+    if best[REFERENCE] != common:
+        name = f"{REFERENCE} at its best top-p"
+        entry = compare_methods(
+            {REFERENCE: realism(REFERENCE, common), name: realism(REFERENCE, best[REFERENCE])}, REFERENCE
+        )
+        sharper = [{**entry[0], "method": REFERENCE, "top_p": best[REFERENCE], "against": common}]
+    return {
+        "metric": cfg.evaluation.metric,
+        "scenes": {**splits.sizes(), "source": cfg.scenes.source},
+        "seeds": list(cfg.seeds),
+        "rows": rows,
+        "paired": paired + sharper,
+        "paired_own_best": best_paired,
+        "top_p": {"common": common, "own_best": best},
+        "per_scene": {m: realism(m, common) for m in methods},
+        "stages": stages,
+        "wall_seconds": sum(stages.values()),
+        "versions": {"python": sys.version.split()[0], **{name: version(name) for name in PACKAGES}},
+        "command": " ".join(["python -m recipes.compare", *sys.argv[1:]]),
+    }
+
+
+def write_report(cfg: DictConfig, splits: Splits, comparison: dict[str, Any]) -> None:
+    """``comparison.json``, its figures and ``index.html`` in the output folder."""
+    folder = Path(cfg.output)
+    write_json(folder / "comparison.json", comparison)
+    if cfg.json is not None:
+        write_json(cfg.json, comparison)
+    plot_comparison(comparison, folder / "comparison.png")
+    seed = cfg.seeds[0]
+    runs = {method: read_curves(folder / f"seed_{seed}" / method) for method in cfg.methods}
+    plot_curves({m: {k: v for k, v in run.items() if k in CURVES} for m, run in runs.items()}, folder / "curves.png")
+    reference = read_curves(folder / f"seed_{seed}" / REFERENCE)
+    plot_curves(
+        {REFERENCE: {k: v for k, v in reference.items() if k.startswith(("train/loss", "tune/"))}},
+        folder / "pretraining.png",
+    )
+    players = play(cfg, splits, seed)
+    plot_scenes(
+        [player.scene for player in players],
+        {method: [player.rollouts[method] for player in players] for method in players[0].rollouts},
+        folder / "scenes.png",
+    )
+    write_page(
+        folder,
+        comparison,
+        [
+            Picture(folder / "comparison.png", "Differences to the reference. Paired per scene, with 95 % intervals."),
+            Picture(
+                folder / "curves.png", f"Alignment of seed {seed}. Likelihood of preferred and unpreferred rollouts."
+            ),
+            Picture(
+                folder / "pretraining.png", f"Pre-training of seed {seed}. Next-token loss on train and tuning scenes."
+            ),
+            Picture(folder / "scenes.png", "Log and rollouts. Evaluation scenes, the same ones for every method."),
+        ],
+        players,
+        config=plain(cfg),
+        method="dpa_omf" if "dpa_omf" in cfg.methods else None,
+    )
+
+
+def play(cfg: DictConfig, splits: Splits, seed: int) -> list[PlayerScene]:
+    """A few evaluation scenes with rollouts of every method at the common top-p."""
+    wanted = list(range(min(cfg.pictures, len(splits.eval))))
+    rollouts: dict[int, dict[str, Any]] = {index: {} for index in wanted}
+    for method in (REFERENCE, *cfg.methods):
+        model, context, _ = open_policy(Path(cfg.output) / f"seed_{seed}" / method / "policy.pt", cfg.device)
+        decoding = Decoding(cfg.decoding.common, cfg.evaluation.temperature)
+        batches = collect_groups(
+            splits.eval, model, wanted, num_rollouts=PLAYED_ROLLOUTS, decoding=decoding, options=context, seed=seed
+        )
+        for batch in batches:
+            poses = simulated_poses(batch, PLAYED_ROLLOUTS).cpu()
+            for row, index in enumerate(batch[keys.SCENE][::PLAYED_ROLLOUTS, 0].tolist()):
+                present = int(splits.eval[index].agents.present.sum())
+                rollouts[index][method] = poses[row, :, :present]
+    return [PlayerScene(splits.eval[index], rollouts[index]) for index in wanted]
+
+
+def _pair_accuracy(folder: Path) -> float:
+    return json.loads((folder / "pair_accuracy.json").read_text(encoding="utf-8"))["pair_accuracy"]

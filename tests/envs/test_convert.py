@@ -1,0 +1,262 @@
+"""Conversion: the same bytes whoever does it and however often it is cut off."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+from pathlib import Path
+
+import pytest
+
+from envs.convert import convert, main
+from envs.scene import SceneError
+from envs.sources import SOURCES, Source, Unit
+from envs.sources.scenario import Scenario
+from envs.sources.synthetic import straight_road
+from envs.sources.tfrecord import frame
+from envs.sources.womd import read_womd
+from envs.store import SceneStore
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+
+def digests(folder: Path) -> dict[str, str]:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+@pytest.fixture
+def raw(make_scenario, tmp_path: Path) -> Path:
+    """A folder of two TFRecord files with three and four scenes."""
+    folder = tmp_path / "raw"
+    folder.mkdir()
+    for name, numbers in (("a.tfrecord", range(3)), ("b.tfrecord-00000-of-00001", range(3, 7))):
+        records = [make_scenario(f"scene{number}", 1 + number % 3).SerializeToString() for number in numbers]
+        (folder / name).write_bytes(b"".join(map(frame, records)))
+    return folder
+
+
+def test_every_scene_of_every_file_in_order(raw: Path, tmp_path: Path) -> None:
+    store = convert("womd", [raw], tmp_path / "out", shard_size=2)
+    assert store.scene_ids == [f"scene{number}" for number in range(7)]
+    assert [entry["scenes"] for entry in store.manifest.shards] == [2, 2, 2, 1]
+    assert store.provenance(4) == (str(raw / "b.tfrecord-00000-of-00001"), 1)
+    assert store.num_agents.tolist() == [1, 2, 3, 1, 2, 3, 1]
+    direct = list(read_womd(raw / "a.tfrecord"))
+    for index, scene in enumerate(direct):
+        assert (store[index].agents == scene.agents).all()
+        assert (store[index].road == scene.road).all()
+        assert (store[index].lights == scene.lights).all()
+    store.verify()
+
+
+def test_inputs_may_be_files_folders_and_patterns(raw: Path, tmp_path: Path) -> None:
+    by_folder = convert("womd", [raw], tmp_path / "one")
+    by_pattern = convert("womd", [raw / "b*", raw / "a.tfrecord"], tmp_path / "two")
+    assert by_pattern.scene_ids == by_folder.scene_ids[3:] + by_folder.scene_ids[:3]
+    with pytest.raises(SceneError, match=r"nothing\*: no input"):
+        convert("womd", [raw / "nothing*"], tmp_path / "three")
+    (raw / "empty").mkdir()
+    with pytest.raises(SceneError, match=r"empty: no input.*\.tfrecord"):
+        convert("womd", [raw / "empty"], tmp_path / "three")
+    assert not (tmp_path / "three").exists()
+
+
+def test_limit_takes_the_first_scenes(raw: Path, tmp_path: Path) -> None:
+    assert convert("womd", [raw], tmp_path / "out", limit=4).scene_ids == [f"scene{number}" for number in range(4)]
+
+
+def test_a_finished_conversion_is_only_opened(raw: Path, tmp_path: Path) -> None:
+    convert("womd", [raw], tmp_path / "out")
+    times = [path.stat().st_mtime_ns for path in sorted((tmp_path / "out").rglob("*"))]
+    convert("womd", [raw], tmp_path / "out")
+    assert [path.stat().st_mtime_ns for path in sorted((tmp_path / "out").rglob("*"))] == times
+
+
+def test_another_conversion_is_not_mixed_in(raw: Path, tmp_path: Path) -> None:
+    convert("womd", [raw], tmp_path / "out")
+    with pytest.raises(SceneError, match="another options"):
+        convert("womd", [raw], tmp_path / "out", shard_size=3)
+    with pytest.raises(SceneError, match="another plan"):
+        convert("womd", [raw / "a.tfrecord"], tmp_path / "out")
+    with pytest.raises(SceneError, match="holds 'a.tfrecord' and no store"):
+        convert("womd", [raw], raw)
+    assert (raw / "a.tfrecord").exists()
+
+
+def test_a_lost_shard_is_made_again_and_leftovers_go(raw: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    convert("womd", [raw], out, shard_size=2)
+    whole = digests(out)
+    shutil.rmtree(out / "00001")
+    (out / ".partial-00001-77").mkdir()
+    manifest = json.loads((out / "manifest.json").read_text())
+    (out / "manifest.json").write_text(json.dumps({**manifest, "complete": False, "shards": []}))
+    convert("womd", [raw], out, shard_size=2)
+    assert digests(out) == whole
+
+
+def test_processes_that_want_the_same_store_wait_for_each_other(raw: Path, tmp_path: Path) -> None:
+    with ThreadPoolExecutor(3) as pool:
+        stores = list(pool.map(lambda _: convert("womd", [raw], tmp_path / "out", shard_size=1), range(3)))
+    assert [len(store) for store in stores] == [7, 7, 7]
+    convert("womd", [raw], tmp_path / "alone", shard_size=1)
+    assert digests(tmp_path / "out") == digests(tmp_path / "alone")
+
+
+def test_a_source_may_generate_its_scenes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    roads = Source(
+        name="roads",
+        help="straight roads",
+        find=list,
+        locate=lambda cars: (Unit(cars, record, seed) for record, seed in enumerate(range(5, 8))),
+        open=lambda cars: nullcontext(lambda unit: straight_road(int(cars), seed=unit.key)),
+    )
+    monkeypatch.setitem(SOURCES, "roads", roads)
+    store = convert("roads", ["2", "4"], tmp_path / "out", shard_size=4)
+    assert store.scene_ids == [f"straight_road_{cars}_{seed}" for cars in (2, 4) for seed in (5, 6, 7)]
+    assert store.provenance(4) == ("4", 1)
+
+
+def damage(raw: Path) -> None:
+    """Make the second record of the second file unreadable."""
+    path = raw / "b.tfrecord-00000-of-00001"
+    data = bytearray(path.read_bytes())
+    second = int.from_bytes(data[:8], "little") + 16
+    data[second + 40] ^= 1
+    path.write_bytes(data)
+
+
+def test_a_bad_record_stops_the_conversion_and_finished_shards_stay(raw: Path, tmp_path: Path, capsys) -> None:
+    damage(raw)
+    out = tmp_path / "out"
+    assert main(["womd", str(raw), str(out), "--shard-size", "3"]) == 2
+    assert "b.tfrecord-00000-of-00001, record 1: the checksum" in capsys.readouterr().err.splitlines()[-1]
+    assert sorted(path.name for path in out.iterdir()) == ["00000", "manifest.json"]
+    with pytest.raises(SceneError, match="has not finished"):
+        SceneStore(out)
+
+
+def test_bad_records_can_be_skipped_and_are_listed(raw: Path, tmp_path: Path, capsys) -> None:
+    damage(raw)
+    with (raw / "b.tfrecord-00000-of-00001").open("ab") as file:
+        file.write(b"rest of a record")
+    out = tmp_path / "out"
+    assert main(["womd", str(raw), str(out), "--shard-size", "3", "--skip-bad"]) == 0
+    store = SceneStore(out)
+    assert store.scene_ids == ["scene0", "scene1", "scene2", "scene3", "scene5", "scene6"]
+    assert [(Path(skip["input"]).name[0], skip["record"]) for skip in store.manifest.skipped] == [("b", 4), ("b", 1)]
+    assert "skipped   2" in capsys.readouterr().out
+    store.verify()
+
+
+def test_a_store_with_gaps_is_not_passed_off_as_whole(raw: Path, tmp_path: Path) -> None:
+    damage(raw)
+    out = tmp_path / "out"
+    convert("womd", [raw], out, skip_bad=True)
+    with pytest.raises(SceneError, match="made without a bad input"):
+        convert("womd", [raw], out)
+
+
+def test_nothing_but_bad_inputs_is_an_error(make_scenario, tmp_path: Path) -> None:
+    bad = make_scenario()
+    bad.ClearField("sdc_track_index")
+    (tmp_path / "bad.tfrecord").write_bytes(frame(bad.SerializeToString()))
+    with pytest.raises(SceneError, match="no input gave a scene; the first error: .*SDC"):
+        convert("womd", [tmp_path / "bad.tfrecord"], tmp_path / "out", skip_bad=True)
+
+
+def test_two_scenes_of_one_id_are_refused(raw: Path, tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match=r"scene scene0 occurs twice: .*a\.tfrecord.*a\.tfrecord"):
+        convert("womd", [raw / "a.tfrecord", raw / "a.tfrecord"], tmp_path / "out", shard_size=2)
+
+
+@pytest.mark.parametrize(("name", "value"), [("workers", 0), ("shard_size", 0), ("limit", 0)])
+def test_numbers_must_be_positive(raw: Path, tmp_path: Path, name: str, value: int) -> None:
+    with pytest.raises(ValueError, match=f"{name} must be 1 or more, got 0"):
+        convert("womd", [raw], tmp_path / "out", **{name: value})
+
+
+def test_info_and_verify(raw: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "out"
+    convert("womd", [raw], out)
+    assert main(["info", str(out)]) == 0
+    assert "7 in 1 shards" in capsys.readouterr().out
+    assert main(["verify", str(out)]) == 0
+    (out / "00000/agents/kind.memmap").write_bytes(bytes(13))
+    assert main(["verify", str(out)]) == 2
+    assert "error: " in capsys.readouterr().err
+    assert main(["info", str(tmp_path / "none")]) == 2
+
+
+def alive(group: int) -> bool:
+    """Whether any process of a process group still runs."""
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            state, _, pgrp = status.read_text().rpartition(")")[2].split()[:3]
+        except OSError:
+            continue
+        if int(pgrp) == group and state != "Z":
+            return True
+    return False
+
+
+def wait_until(condition, seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.01)
+
+
+@pytest.mark.slow
+def test_killed_with_two_workers_and_resumed_with_one_gives_the_same_bytes(make_scenario, tmp_path: Path) -> None:
+    records = [make_scenario(f"scene{number}", 30).SerializeToString() for number in range(3)]
+    raw = tmp_path / "many.tfrecord"
+    for number in range(100):
+        scenario = Scenario.FromString(records[number % 3])
+        scenario.scenario_id = f"scene{number}"
+        with raw.open("ab") as file:
+            file.write(frame(scenario.SerializeToString()))
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    command = [sys.executable, "-m", "envs.convert", "womd", raw, cut, "--shard-size", "4", "--workers", "2"]
+    process = subprocess.Popen(command, cwd=REPOSITORY, stderr=subprocess.DEVNULL, start_new_session=True)
+    try:
+        wait_until((cut / "00001").exists)
+    finally:
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    wait_until(lambda: not alive(process.pid))
+    with pytest.raises(SceneError, match="has not finished"):
+        SceneStore(cut)
+    convert("womd", [raw], cut, shard_size=4)
+    convert("womd", [raw], whole, shard_size=4)
+    assert len(SceneStore(cut)) == 100
+    assert digests(cut) == digests(whole)
+
+
+def test_two_workers_give_the_same_bytes_as_one(raw: Path, tmp_path: Path) -> None:
+    convert("womd", [raw], tmp_path / "one", shard_size=2)
+    convert("womd", [raw], tmp_path / "two", shard_size=2, workers=2)
+    assert digests(tmp_path / "one") == digests(tmp_path / "two")
+
+
+def test_real_files_convert(shared: Path, tmp_path: Path) -> None:
+    store = convert("womd", [shared / "scenes/womd"], tmp_path / "womd")
+    assert store.scene_ids == ["637f20cafde22ff8", "ee519cf571686d19"]
+    assert store.num_agents.tolist() == [50, 84]  # SPEC section 1.2
+    lights = convert("gpudrive", [shared / "scenes/gpudrive/lights"], tmp_path / "lights", limit=2)
+    assert lights.scene_ids == ["238786b3cccc4a0e", "48b0814dee9301a0"]
+    for source in (store, lights):
+        source.verify()
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])

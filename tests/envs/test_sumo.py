@@ -1,0 +1,437 @@
+"""Scenes simulated with SUMO: what a map must be, how bodies may move, and that seeds decide everything."""
+
+from __future__ import annotations
+
+import importlib.util
+import multiprocessing
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from envs.geometry.boxes import nearest_box_distance
+from envs.geometry.edges import RoadEdges
+from envs.scene import (
+    CURRENT_STEP,
+    EDGE_KINDS,
+    LANE_KINDS,
+    LOG_STEPS,
+    STEP_SECONDS,
+    AgentKind,
+    LightState,
+    LinkKind,
+    MapKind,
+    Scene,
+    SceneError,
+    polylines,
+)
+from envs.sources import sumo
+from envs.sources.sumo_map import GUTTER, NetMap, build_map
+from envs.sources.sumo_network import NetConnection, NetEdge, NetLane, Network, run_sumo, sumo_binary
+from envs.sources.sumo_scene import cut_map
+from envs.sources.sumo_tracks import make_tracks, smooth, trail
+from envs.sources.sumo_traffic import Recording
+
+shapely = pytest.importorskip("shapely", reason="needs the extra `sumo`")
+pytest.importorskip("sumolib", reason="needs the extra `sumo`")
+
+LANE_WIDTH = 3.2
+SMALL = {"windows": 2, "warmup": 15.0, "scenes_per_unit": 8}
+
+
+# --- simulated scenes ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def scenes() -> list[Scene]:
+    """Scenes of every kind of network."""
+    kinds = [name for name in sumo.presets() if name != "mixed"]
+    return [scene for kind in kinds for scene in sumo.generate(8, seed=11, preset=kind, **SMALL)]
+
+
+def boxes_of(scene: Scene) -> torch.Tensor:
+    """``[L, A, 5]`` boxes of a scene."""
+    agents = scene.agents
+    size = agents.extent[:, None, :2].expand(-1, LOG_STEPS, -1)
+    return torch.cat((agents.position[..., :2], agents.heading[..., None], size), -1).transpose(0, 1)
+
+
+def vehicle_motion(scenes: list[Scene]) -> dict[str, torch.Tensor]:
+    """Speed, acceleration, yaw rate and the part of a step that speed does not explain, of all vehicle steps."""
+    rows: dict[str, list[torch.Tensor]] = {"speed": [], "acceleration": [], "yaw_rate": [], "jump": []}
+    for scene in scenes:
+        agents = scene.agents
+        cars = agents.kind == AgentKind.VEHICLE
+        valid = agents.valid[cars]
+        both = valid[:, 1:] & valid[:, :-1]
+        speed = agents.velocity[cars].norm(dim=-1)
+        turn = agents.heading[cars].diff(dim=1)
+        step = agents.position[cars].diff(dim=1).norm(dim=-1)
+        rows["speed"].append(speed[valid])
+        rows["acceleration"].append((speed.diff(dim=1) / STEP_SECONDS)[both])
+        rows["yaw_rate"].append((torch.atan2(turn.sin(), turn.cos()) / STEP_SECONDS)[both])
+        rows["jump"].append((step - speed[:, 1:] * STEP_SECONDS)[both])
+    return {name: torch.cat(values) for name, values in rows.items()}
+
+
+def test_a_scene_is_a_window_around_a_moving_car(scenes: list[Scene]) -> None:
+    options = sumo.make_options()
+    for scene in scenes:
+        agents = scene.validate().agents
+        assert agents.position.shape[1:] == (LOG_STEPS, 3)
+        assert options.min_agents <= len(agents.kind) <= options.max_agents
+        assert agents.present.all() and agents.sdc[0] and agents.kind[0] == AgentKind.VEHICLE
+        assert agents.valid[0].all() and agents.position[0, CURRENT_STEP, :2].abs().max() == 0
+        assert agents.position[:, CURRENT_STEP].norm(dim=-1).max() <= options.radius + 2
+        assert (agents.position[0].diff(dim=0).norm(dim=-1)).sum() > 4
+        assert torch.allclose(agents.position[..., 2][agents.valid].amin(), agents.extent[:, 2].amin() / 2)
+        assert agents.heading.abs().max() <= torch.pi
+
+
+def test_agents_to_predict_stay_to_the_end_and_are_of_several_kinds(scenes: list[Scene]) -> None:
+    kinds = set()
+    for scene in scenes:
+        predict = scene.agents.predict
+        assert predict.sum() <= sumo.make_options().max_predict and not predict[scene.agents.sdc].any()
+        assert scene.agents.valid[predict].all()
+        kinds |= set(scene.agents.kind[predict].tolist())
+    assert kinds == {AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST}
+
+
+def test_scene_ids_are_unique(scenes: list[Scene]) -> None:
+    assert len({scene.scene_id for scene in scenes}) == len(scenes) == 32
+
+
+def test_maps_are_small_and_whole(scenes: list[Scene]) -> None:
+    for scene in scenes:
+        road = scene.road
+        assert 100 < len(road.points) < 4000 and int(road.count.sum()) == len(road.points)
+        assert road.count[torch.isin(road.kind, torch.tensor(LANE_KINDS + EDGE_KINDS))].min() >= 2
+        assert len(road.feature_id.unique()) == len(road.feature_id)
+        assert torch.isin(road.links[:, :2], road.feature_id).all()
+        assert (road.speed_limit[torch.isin(road.kind, torch.tensor(LANE_KINDS))] > 5).all()
+    kinds = {int(kind) for scene in scenes for kind in scene.road.kind}
+    assert kinds >= {MapKind.LANE_BIKE, MapKind.CROSSWALK, MapKind.STOP_SIGN, MapKind.LINE_BROKEN_WHITE}
+
+
+def test_lanes_lie_on_the_drivable_side_of_the_road_edges(scenes: list[Scene]) -> None:
+    for scene in scenes:
+        edges = RoadEdges.from_polylines(polylines(scene, EDGE_KINDS))
+        inside = scene.agents.position[0, CURRENT_STEP].norm() + 60.0  # away from where the map was cut off
+        lanes = torch.cat([lane[1:-1] for lane in polylines(scene, LANE_KINDS) if len(lane) > 2])
+        lanes = lanes[lanes.norm(dim=-1) < inside]
+        assert (edges.signed_distance(lanes) < 0).float().mean() > 0.995
+
+
+def test_vehicles_stay_on_the_road(scenes: list[Scene]) -> None:
+    centre, corner = [], []
+    for scene in scenes:
+        edges = RoadEdges.from_polylines(polylines(scene, EDGE_KINDS))
+        agents = scene.agents
+        cars = agents.valid & (agents.kind == AgentKind.VEHICLE)[:, None]
+        extent = agents.extent[:, None].expand(-1, LOG_STEPS, -1)[cars]
+        ground = agents.position[cars] - extent * torch.tensor([0, 0, 0.5])
+        centre.append(edges.signed_distance(ground) > 0)
+        corner.append(edges.box_offroad_distance(agents.position[cars], agents.heading[cars], extent) > 0)
+    assert torch.cat(centre).float().mean() < 0.001
+    assert torch.cat(corner).float().mean() < 0.01
+
+
+def test_no_vehicle_or_cyclist_collides(scenes: list[Scene]) -> None:
+    for scene in scenes:
+        wheels = (scene.agents.kind != AgentKind.PEDESTRIAN).nonzero()[:, 0]
+        gap = nearest_box_distance(boxes_of(scene), scene.agents.valid.T, ego=wheels, rounding=0.0)
+        assert gap.min() >= 0
+
+
+def test_vehicles_move_within_physical_limits(scenes: list[Scene]) -> None:
+    motion = vehicle_motion(scenes)
+    assert motion["speed"].max() < 30 and (motion["speed"] < 0.1).float().mean() < 0.7
+    assert motion["acceleration"].abs().max() < 8
+    assert motion["yaw_rate"].abs().quantile(0.999) < 1.5
+    assert motion["jump"].max() < 0.5
+
+
+def test_vehicles_face_where_they_go(scenes: list[Scene]) -> None:
+    for scene in scenes:
+        agents = scene.agents
+        moving = agents.valid & (agents.velocity.norm(dim=-1) > 2) & (agents.kind == AgentKind.VEHICLE)[:, None]
+        direction = torch.atan2(agents.velocity[..., 1], agents.velocity[..., 0])
+        assert (direction - agents.heading)[moving].cos().min() > 0.8
+
+
+def test_nobody_drives_over_a_line_while_its_light_is_red(scenes: list[Scene]) -> None:
+    approaches = 0
+    for scene in scenes:
+        red = (scene.lights.state == LightState.STOP).all(1)
+        lane_of = {int(name): i for i, name in enumerate(scene.road.feature_id)}
+        for light in red.nonzero()[:, 0]:
+            row = lane_of[int(scene.lights.lane_id[light])]
+            lane = scene.road.points[scene.road.start[row] :][: scene.road.count[row], :2]
+            stop = scene.lights.stop_point[light, 0, :2]
+            assert torch.equal(stop, lane[0])
+            along = (lane[1] - lane[0]) / (lane[1] - lane[0]).norm()
+            agents = scene.agents
+            cars = (agents.kind == AgentKind.VEHICLE) & agents.valid.all(1)
+            facing = torch.stack((agents.heading.cos(), agents.heading.sin()), -1)[cars]
+            offset = agents.position[cars, :, :2] - stop
+            front = (offset * along).sum(-1) + agents.extent[cars, None, 0] / 2
+            aside = (offset[..., 0] * along[1] - offset[..., 1] * along[0]).abs()
+            near = (aside < 1.0) & ((facing * along).sum(-1) > 0.95)
+            over = near[:, 1:] & near[:, :-1] & (front[:, :-1] < 0) & (front[:, 1:] > 0)
+            approaches += int((near & (front > -3) & (front < 0)).any(1).sum())
+            assert not over.any(), f"{scene.scene_id}: light {int(scene.lights.lane_id[light])}"
+    assert approaches > 0
+
+
+def test_lanes_that_are_linked_meet_or_lie_side_by_side(scenes: list[Scene]) -> None:
+    seen = set()
+    for scene in scenes:
+        road = scene.road
+        lines = {
+            int(n): road.points[s : s + c, :2] for n, s, c in zip(road.feature_id, road.start, road.count, strict=True)
+        }
+        for first, second, kind in road.links.tolist():
+            one, other = lines[first], lines[second]
+            seen.add(kind)
+            if kind == LinkKind.EXIT and one[-1].norm() < 60 and other[0].norm() < 60:
+                assert (one[-1] - other[0]).norm() < 0.1
+            elif kind != LinkKind.EXIT and max(one[0].norm(), other[0].norm()) < 60:
+                along, across = one[1] - one[0], other[0] - one[0]
+                left = along[0] * across[1] - along[1] * across[0] > 0
+                assert bool(left) == (kind == LinkKind.LEFT)
+    assert seen == set(LinkKind)
+
+
+# --- seeds, splits and workers ---------------------------------------------------------------------------------------
+
+
+def same(one: Scene, other: Scene) -> bool:
+    parts = [
+        part
+        for part in ("agents", "road", "lights", "origin")
+        if not (getattr(one, part) == getattr(other, part)).all()
+    ]
+    return one.scene_id == other.scene_id and not parts
+
+
+def test_a_unit_gives_the_same_scenes_in_any_process() -> None:
+    unit = sumo.units(2, seed=4, preset="town", windows=1, warmup=5.0)[0]
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        elsewhere = pool.map(sumo.simulate, [unit])[0]
+    here = sumo.simulate(unit)
+    assert len(here) == 2 and all(same(a, b) for a, b in zip(here, elsewhere, strict=True))
+    other = sumo.simulate(sumo.units(2, seed=5, preset="town", windows=1, warmup=5.0)[0])
+    assert not torch.equal(other[0].road.points, here[0].road.points)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.tuples(st.sampled_from(sumo.SPLITS), st.integers(0, 9999)), min_size=2, max_size=4, unique=True))
+def test_no_two_splits_or_seeds_share_a_network(runs: list[tuple[str, int]]) -> None:
+    numbers = [unit.number for split, seed in runs for unit in sumo.units(100, seed, split=split, scenes_per_unit=10)]
+    assert len(set(numbers)) == len(numbers) and max(numbers) < 2**31
+
+
+@given(st.integers(1, 200), st.integers(1, 30))
+def test_units_add_up_to_the_scenes_asked_for(num_scenes: int, per_unit: int) -> None:
+    parts = [unit.num_scenes for unit in sumo.units(num_scenes, scenes_per_unit=per_unit)]
+    assert sum(parts) == num_scenes and max(parts) <= per_unit
+
+
+def test_the_source_gives_what_a_unit_gives() -> None:
+    request = "num_scenes=2,seed=4,preset=town,windows=1,warmup=5.0"
+    (text,) = sumo.SUMO.find([request])
+    unit = sumo.units(2, seed=4, preset="town", windows=1, warmup=5.0)[0]
+    assert text == unit.text
+    assert all(same(a, b) for a, b in zip(sumo.SUMO.scenes(text), sumo.simulate(unit), strict=True))
+
+
+# --- bad requests ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("request_words", "message"),
+    [
+        ({"preset": "village"}, "no preset 'village'.*arterial"),
+        ({"split": "eval"}, "no split 'eval'.*test"),
+        ({"rdius": 5.0}, "no option 'rdius'.*radius"),
+        ({"radius": -5.0}, "radius must be positive, got -5.0"),
+        ({"window_spacing": 3.0}, "window_spacing must be at least 9.1 s, got 3.0"),
+        ({"seed": 10_000}, "seed must lie in 0 ... 9999, got 10000"),
+        ({"num_scenes": 0}, "num_scenes must lie in 1 ... 120000, got 0"),
+    ],
+)
+def test_a_bad_request_says_what_is_possible(request_words: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        sumo.units(**({"num_scenes": 3} | request_words))
+
+
+def test_a_request_in_words_must_be_complete() -> None:
+    with pytest.raises(ValueError, match="num_scenes=160"):
+        sumo.SUMO.find(["seed=3"])
+    with pytest.raises(ValueError, match="'seed' is not of the form name=value"):
+        sumo.SUMO.find(["num_scenes=3,seed"])
+
+
+def test_too_many_scenes_for_one_simulation_is_an_error() -> None:
+    unit = sumo.units(2, preset="town", windows=1, warmup=1.0, min_agents=500)[0]
+    with pytest.raises(SceneError, match="holds only 0 of 2 scenes; lower"):
+        sumo.simulate(unit)
+
+
+def test_without_sumo_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r"pip install 'dpa-omf\[sumo\]'"):
+        next(sumo.generate(1))
+
+
+def test_a_failure_of_sumo_is_told() -> None:
+    with pytest.raises(RuntimeError, match="(?s)netgenerate failed.*No option with the name 'no-such-option'"):
+        run_sumo("netgenerate", {"no-such-option": 1})
+    assert Path(sumo_binary("sumo")).exists()
+
+
+# --- a map worked out by hand ----------------------------------------------------------------------------------------
+
+
+def straight_network() -> Network:
+    """A street along x of 100 m, two lanes east and one west; then a connector and a street of one lane."""
+
+    def lane(name: str, points: list[tuple[float, float]], role: str = "street") -> NetLane:
+        edge, index = name.rsplit("_", 1)
+        return NetLane(name, edge, int(index), "vehicle", role, LANE_WIDTH, 13.9, np.array(points))
+
+    east = (lane("east_0", [(0, -4.8), (100, -4.8)]), lane("east_1", [(0, -1.6), (100, -1.6)]))
+    west = (lane("west_0", [(100, 1.6), (0, 1.6)]),)
+    onward = (lane("onward_0", [(110, -1.6), (200, -1.6)]),)
+    connector = lane(":J_0_0", [(100, -1.6), (110, -1.6)], "internal")
+    edges = [NetEdge("east", "A", "J", east), NetEdge("west", "J", "A", west), NetEdge("onward", "J", "B", onward)]
+    return Network(
+        path=Path("net.xml"),
+        lanes={item.lane_id: item for item in (*east, *west, *onward, connector)},
+        edges={edge.edge_id: edge for edge in edges},
+        connections=(NetConnection("east_1", "onward_0", (":J_0_0",), "J", 0, False),),
+        dead_ends=frozenset({"A", "B"}),
+    )
+
+
+@pytest.fixture(scope="module")
+def straight_map() -> NetMap:
+    return build_map(straight_network(), point_spacing=5.0)
+
+
+def test_the_road_edge_runs_counter_clockwise_around_the_lanes(straight_map: NetMap) -> None:
+    (ring,) = [feature.points for feature in straight_map.features if feature.kind in EDGE_KINDS]
+    assert np.array_equal(ring[0], ring[-1]) and shapely.LinearRing(ring).is_ccw
+    assert np.linalg.norm(np.diff(ring, axis=0), axis=1).max() <= 5.0
+    street = ring[(ring[:, 0] > 10) & (ring[:, 0] < 90)]
+    borders = [-2 * LANE_WIDTH - GUTTER, LANE_WIDTH + GUTTER]
+    assert np.allclose(np.sort(np.unique(street[:, 1].round(2))), borders, atol=0.06)
+
+
+def test_lines_and_links_of_a_street(straight_map: NetMap) -> None:
+    lines = {feature.kind: feature.points for feature in straight_map.features}
+    assert np.allclose(lines[MapKind.LINE_BROKEN_WHITE][:, 1], -3.2)
+    assert np.allclose(lines[MapKind.LINE_SOLID_DOUBLE_YELLOW][:, 1], 0.0)
+    lanes = [feature for feature in straight_map.features if feature.kind in LANE_KINDS]
+    names = dict(zip(("right", "left", "west", "onward", "connector"), (f.feature_id for f in lanes), strict=True))
+    assert {tuple(row) for row in straight_map.links.tolist()} == {
+        (names["left"], names["connector"], LinkKind.EXIT),
+        (names["connector"], names["onward"], LinkKind.EXIT),
+        (names["right"], names["left"], LinkKind.LEFT),
+        (names["left"], names["right"], LinkKind.RIGHT),
+    }
+    assert straight_map.signals[0].lane_id == names["connector"]
+    assert straight_map.signals[0].stop_point.tolist() == [100, -1.6]
+
+
+def test_ways_out_end_in_dead_ends() -> None:
+    assert straight_network().ways_out() == {"east": ["onward"], "west": ["west"], "onward": ["onward"]}
+
+
+def test_a_cut_map_keeps_stretches_of_the_ring_and_their_side(straight_map: NetMap) -> None:
+    region = shapely.box(20, -20, 60, 20)
+    road, begun = cut_map(straight_map, region, np.array([40.0, 0.0]))
+    edge = torch.isin(road.kind, torch.tensor(EDGE_KINDS))
+    assert edge.sum() == 2 and len(set(road.feature_id.tolist())) == len(road.kind)
+    assert not begun  # no lane begins in the region
+    south, north = (road.points[s : s + n] for s, n in zip(road.start[edge], road.count[edge], strict=True))
+    if south[0, 1] > 0:
+        south, north = north, south
+    assert (south[:, 0].diff() > 0).all() and (north[:, 0].diff() < 0).all()  # the road on the left of both
+    assert road.points[:, 0].abs().max() <= 25
+
+
+def test_a_ring_inside_the_region_stays_closed(straight_map: NetMap) -> None:
+    road, begun = cut_map(straight_map, shapely.box(-50, -50, 300, 50), np.zeros(2))
+    (row,) = torch.isin(road.kind, torch.tensor(EDGE_KINDS)).nonzero()[:, 0]
+    ring = road.points[road.start[row] : road.start[row] + road.count[row]]
+    assert torch.equal(ring[0], ring[-1]) and len(begun) == 5
+
+
+# --- from bumpers to boxes -------------------------------------------------------------------------------------------
+
+
+def record(front: np.ndarray, angle: float, speed: float, length: float = 4.0) -> Recording:
+    """One car."""
+    steps = len(front)
+    return Recording(
+        kind=np.array([int(AgentKind.VEHICLE)]),
+        is_car=np.array([True]),
+        extent=np.array([[length, 1.8, 1.5]]),
+        front=front[None],
+        angle=np.full((1, steps), angle),
+        speed=np.full((1, steps), speed),
+        lights={},
+    )
+
+
+@pytest.mark.parametrize(
+    ("angle", "heading"), [(0.0, np.pi / 2), (90.0, 0.0), (180.0, -np.pi / 2), (225.0, -3 * np.pi / 4)]
+)
+def test_front_bumper_and_compass_become_centre_and_heading(angle: float, heading: float) -> None:
+    direction = np.array([np.cos(heading), np.sin(heading)])
+    front = 10.0 * STEP_SECONDS * np.arange(40)[:, None] * direction
+    tracks = make_tracks(record(front, angle, 10.0))
+    assert np.allclose(tracks.centre[0], front - 2.0 * direction)
+    assert np.allclose(np.cos(tracks.heading[0] - heading), 1.0)
+    assert np.allclose(tracks.velocity[0], 10.0 * direction)
+
+
+def test_a_teleport_or_a_hole_parts_a_track() -> None:
+    front = np.stack((np.arange(60.0), np.zeros(60)), -1)
+    front[20:] += 5.0
+    recording = record(front, 90.0, 10.0)
+    recording.speed[0, 40:44] = np.nan
+    recording.front[0, 40:44] = np.nan
+    tracks = make_tracks(recording)
+    assert [np.flatnonzero(valid)[[0, -1]].tolist() for valid in tracks.valid] == [[0, 19], [20, 39], [44, 59]]
+    assert tracks.track_id.tolist() == [1, 2, 3]
+    assert np.allclose(tracks.velocity[tracks.valid], [10.0, 0.0])
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(-20, 20), st.floats(-20, 20), st.integers(8, 40))
+def test_smoothing_keeps_uniform_motion(vx: float, vy: float, steps: int) -> None:
+    line = np.arange(steps)[:, None] * np.array([vx, vy]) * STEP_SECONDS
+    assert np.allclose(smooth(line), line, atol=1e-9)
+
+
+def test_a_standing_body_never_turns_and_a_pulled_one_keeps_its_distance() -> None:
+    rng = np.random.default_rng(0)
+    path = np.cumsum(rng.normal(size=(3, 80, 2)) * 0.05 + [0.5, 0.0], axis=1)
+    path[:, 50:] = path[:, 49:50]
+    distance = np.array([0.5, 1.4, 3.0])
+    heading = trail(path, np.zeros((3, 80)), distance)
+    assert np.ptp(heading[:, 50:], axis=1).max() == pytest.approx(0, abs=1e-12)
+    pulled = path - distance[:, None, None] * np.stack((np.cos(heading), np.sin(heading)), -1)
+    step = np.diff(pulled, axis=1)
+    sideways = step[..., 0] * np.sin(heading[:, 1:]) - step[..., 1] * np.cos(heading[:, 1:])
+    assert np.abs(sideways).max() < 0.03  # the pulled point moves along the body
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])
