@@ -24,8 +24,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
+from envs.progress import progress
 from envs.scene import Scene, SceneError
 from envs.shards import PARTIAL_PREFIX, RECORD_FILE, ShardRecord, file_digest, read_record, write_shard
 from envs.sources import SOURCES, Source, Unit
@@ -64,7 +63,7 @@ def convert(
     shard_size: int = SHARD_SIZE,
     limit: int | None = None,
     skip_bad: bool = False,
-    progress: bool = False,
+    show_progress: bool = False,
 ) -> SceneStore:
     """Convert inputs to a store, or go on with a conversion that was cut off.
 
@@ -79,7 +78,7 @@ def convert(
         shard_size: scenes in a shard.
         limit: take only so many scenes, the first ones.
         skip_bad: leave inputs out that give no scene, and list them in the manifest.
-        progress: show a progress bar on stderr.
+        show_progress: show a progress bar on stderr.
 
     Raises:
         SceneError: a bad input (naming it and the record; finished shards are kept), two scenes of one id, or ``out``
@@ -107,7 +106,7 @@ def convert(
                 ShardTask(source, units[start : start + shard_size], out / f"{start // shard_size:05d}", skip_bad)
                 for start in range(0, len(units), shard_size)
             ]
-            _make_shards(tasks, workers, progress)
+            _make_shards(tasks, workers, out.name, show_progress)
             write_manifest(out, _completed(manifest, [task.folder for task in tasks]))
     store = SceneStore(out)
     if store.manifest.skipped and not skip_bad:
@@ -177,7 +176,7 @@ def _resume(out: Path, manifest: Manifest) -> bool:
     return before.complete
 
 
-def _make_shards(tasks: list[ShardTask], workers: int, progress: bool) -> None:
+def _make_shards(tasks: list[ShardTask], workers: int, name: str, show: bool) -> None:
     """Make the shards that are not there yet."""
     seen: dict[str, tuple[str, int]] = {}
     missing = []
@@ -187,7 +186,9 @@ def _make_shards(tasks: list[ShardTask], workers: int, progress: bool) -> None:
         else:
             missing.append(task)
     total, todo = (sum(len(task.units) for task in some) for some in (tasks, missing))
-    with tqdm(total=total, initial=total - todo, unit="scene", disable=not progress) as bar:
+    with progress(
+        total=total, initial=total - todo, description=f"convert {name}", unit="scene", disable=not show
+    ) as bar:
         for task in run_tasks(make_shard, missing, workers, bar.update):
             _check_ids(read_record(task.folder), seen)
 
@@ -298,11 +299,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command, out = options.pop("command"), options.pop("out")
     try:
         if command in SOURCES:
-            store = convert(command, options.pop("paths"), out, progress=True, **options)
+            store = convert(command, options.pop("paths"), out, show_progress=True, **options)
         else:
             store = SceneStore(out)
         if command == "verify":
-            with tqdm(total=len(store), unit="scene") as bar:
+            with progress(total=len(store), description="verify", unit="scene") as bar:
                 store.verify(bar.update)
         sys.stdout.write(describe(store) + "\n")
     except ValueError as error:

@@ -17,7 +17,7 @@ from dpa.preferences import PreferenceStore, PreferenceWriter, Provenance
 from dpa.ranking import PreferenceDistance
 from dpa.ranking.transform import RankRollouts
 from dpa.rollout import Decoding, collect_groups
-from dpa.training.progress import progress
+from envs.progress import progress
 from envs.store import SceneStore
 from recipes.cli import CONFIG, build, plain, recipe
 from recipes.models import open_policy, weights_digest

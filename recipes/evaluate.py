@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 from dpa.ranking import PreferenceDistance
 from dpa.realism import mean_result, realism
 from dpa.rollout import Decoding, collect_groups, lifted, simulated_poses
-from dpa.training.progress import progress
+from envs.progress import progress
 from envs import keys
 from envs.scene import CURRENT_STEP
 from envs.store import SceneStore

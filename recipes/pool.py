@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from dpa.training.progress import progress, stage
+from envs.progress import progress, stage
 
 
 class Job(NamedTuple):

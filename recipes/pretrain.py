@@ -19,7 +19,7 @@ from dpa.losses import NextTokenLoss, token_network
 from dpa.policy import MotionLM, make_context
 from dpa.training.batches import Item, ShuffledOrder, collate_items, crop_agents, log_item
 from dpa.training.optim import clip_and_step, make_optimizer, make_schedule
-from dpa.training.progress import progress
+from envs.progress import progress
 from dpa.training.run import Run
 from dpa.training.seeding import make_generator, seed_everything
 from envs.augment import mirror

@@ -68,4 +68,4 @@ def _open(cfg: DictConfig, paths: str | ListConfig) -> SceneStore:
         return SceneStore(inputs[0])
     name = hashlib.sha256("\n".join([cfg.source, *inputs]).encode()).hexdigest()[:12]
     folder = Path(cfg.cache) / f"{cfg.source}_{name}"
-    return convert(cfg.source, inputs, folder, workers=cfg.workers, progress=True)
+    return convert(cfg.source, inputs, folder, workers=cfg.workers, shard_size=cfg.shard_size, show_progress=True)

@@ -119,6 +119,8 @@ class ContrastivePreferenceLoss(LossModule):
         if cloning < 0:
             raise ValueError(f"cloning must not be negative, got {cloning}.")
         self.convert_to_functional(actor_network, "actor_network", create_target_params=reference)
+        # The reference stays as it is: tell torchrl, which warns otherwise, that no updater is missing.
+        self._has_update_associated["actor_network"] = True
         self.alpha, self.conservative, self.reference = alpha, conservative, reference
         self.score_reduction, self.cloning = score_reduction, cloning
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from dpa.training.checkpoint import Checkpointer, Stateful, capture, restore
 from dpa.training.loggers import Backend, make_logger
-from dpa.training.progress import progress
+from envs.progress import progress
 
 
 class Run:

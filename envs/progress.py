@@ -57,6 +57,7 @@ def progress(
     total: int | None = None,
     initial: int = 0,
     unit: str = "it",
+    disable: bool = False,
     stream: TextIO | None = None,
 ) -> tqdm:
     """A progress bar with count, rate and remaining time.
@@ -70,6 +71,7 @@ def progress(
         total: number of items; by default the length of ``iterable``.
         initial: items done before a resume; they do not count for the rate.
         unit: name of one item.
+        disable: show nothing.
         stream: where the bar goes; standard error by default.
 
     Returns:
@@ -91,6 +93,7 @@ def progress(
         total=total,
         initial=initial,
         unit=unit,
+        disable=disable,
         file=stream if terminal else _Lines(stream),
         mininterval=0.2 if terminal else LOG_INTERVAL,
         # Plain lines have no cursor to move: every bar writes at position 0.

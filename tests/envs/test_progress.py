@@ -6,8 +6,8 @@ import io
 
 import pytest
 
-from dpa.training import progress as module
-from dpa.training.progress import progress, stage
+from envs import progress as module
+from envs.progress import progress, stage
 
 
 def test_lines_in_a_log_have_no_control_characters_and_name_rate_and_rest(monkeypatch: pytest.MonkeyPatch) -> None:
