@@ -2,8 +2,8 @@
 
     python -m recipes.align method=dpa_omf policy=runs/pretrain/policy.pt preferences=runs/preferences
 
-Methods differ in one YAML each: dpa_omf, dpa_adef, sft_best_oa, sft_best_ade, adversarial_afd. Run the same command again to
-go on after a kill.
+Methods differ in one YAML each: dpa_omf, dpa_adef, sft_best_oa, sft_best_ade, adversarial_afd. Run the same command
+again to go on after a kill.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from torchrl.objectives import LossModule
 from dpa.losses import ContrastivePreferenceLoss, NextTokenLoss, token_network
 from dpa.policy import MotionLM
 from dpa.preferences import PreferenceStore
-from dpa.training.batches import Item, ShuffledOrder, collate_items
+from dpa.training.batches import Item, ShuffledOrder, collate_items, micro_batches
 from dpa.training.optim import clip_and_step, make_optimizer, make_schedule
 from dpa.training.run import Run
 from dpa.training.seeding import make_generator, seed_everything
 from envs import keys
 from envs.store import SceneStore
-from recipes.candidates import Candidates, make_candidates
+from recipes.candidates import Group, make_candidates
 from recipes.cli import CONFIG, build, plain, recipe
 from recipes.models import open_policy, weights_digest, write_policy
 from recipes.scenes import fingerprint, open_splits
@@ -84,11 +84,9 @@ def align(
     with run:
         for step in run.steps():
             draw = make_generator(seed, "pairs", step)
-            batch = make_batch(candidates, order(step), options.pairs_per_scene, draw).to(cfg.device)
-            losses = loss(batch)
-            sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+            losses = accumulate(loss, [candidates[i] for i in order(step)], options, draw, cfg.device)
             norm = clip_and_step(optimizer, options.max_norm, schedule)
-            run.log({f"train/{key}": value.detach() for key, value in losses.items()} | {"train/gradient_norm": norm})
+            run.log({f"train/{key}": value for key, value in losses.items()} | {"train/gradient_norm": norm})
     write_policy(path, model, config, {"method": method.name, "seed": seed, "options": decided_by})
     return path
 
@@ -101,22 +99,36 @@ def make_loss(section: DictConfig, model: MotionLM) -> LossModule:
     return build(LOSSES[section.kind], DictConfig(options), f"method.loss ({section.kind})", token_network(model))
 
 
-def make_batch(candidates: Candidates, indices: list[int], num: int, draw: torch.Generator) -> TensorDict:
-    """A batch of ``num`` pairs (or targets) of each of some scenes.
+def accumulate(
+    loss: LossModule, groups: list[Group], options: DictConfig, draw: torch.Generator, device: str
+) -> dict[str, torch.Tensor]:
+    """Gradients of the mean loss over scenes, part by part; returns each figure over all pairs of the step."""
+    chosen = [torch.randperm(len(group.preferred), generator=draw)[: options.pairs_per_scene] for group in groups]
+    sizes = [group.token_valid.shape[0] * options.pairs_per_scene for group in groups]
+    means: dict[str, torch.Tensor] = {}
+    for part in micro_batches(sizes, options.max_rows):
+        losses = loss(make_batch([(groups[i], chosen[i]) for i in part]).to(device))
+        share = len(part) / len(groups)
+        (share * sum(value for key, value in losses.items() if key.startswith("loss_"))).backward()
+        if "logit_std" in losses.keys():
+            losses["logit_square"] = losses["logit_std"] ** 2 + losses["logit_mean"] ** 2
+        for key, value in losses.items():
+            means[key] = means.get(key, 0) + share * value.detach()
+    if "logit_square" in means:  # the spread over all pairs, not the mean of the parts' spreads
+        means["logit_std"] = (means.pop("logit_square") - means["logit_mean"] ** 2).clamp(min=0).sqrt()
+    return means
+
+
+def make_batch(chosen: list[tuple[Group, torch.Tensor]]) -> TensorDict:
+    """A batch of some pairs (or targets) of each of some scenes.
 
     Pairs become ``preferred`` and ``unpreferred``, targets ``tokens``; a method has the one or the other.
     """
-    sides: list[list[Item]] = [[], []]
-    for index in indices:
-        group = candidates[index]
-        chosen = torch.randperm(len(group.preferred), generator=draw)[:num]
-        for side, tokens in zip(sides, (group.preferred, group.unpreferred), strict=True):
-            if tokens is not None:
-                side.append(Item(group.context, tokens[chosen], group.token_valid))
-    batch = collate_items(sides[0])
-    if sides[1]:
-        batch[keys.UNPREFERRED] = collate_items(sides[1])[keys.TOKENS]
+    batch = collate_items([Item(group.context, group.preferred[rows], group.token_valid) for group, rows in chosen])
+    if chosen[0][0].unpreferred is not None:
+        other = [Item(group.context, group.unpreferred[rows], group.token_valid) for group, rows in chosen]
         batch.rename_key_(keys.TOKENS, keys.PREFERRED)
+        batch[keys.UNPREFERRED] = collate_items(other)[keys.TOKENS]
     return batch
 
 

@@ -50,8 +50,8 @@ def make_candidates(
     """Candidates of every scene of a store.
 
     Args:
-        data: ``kind`` (one of :data:`DATA`), ``rank_by`` (``distance`` or ``ade``; not for adversarial) and ``num``: pairs or
-            targets of a scene.
+        data: ``kind`` (one of :data:`DATA`), ``rank_by`` (``distance`` or ``ade``; not for adversarial) and ``num``:
+            pairs or targets of a scene.
         store: ranked rollouts.
         scenes: that they are of.
         options: how scenes are cut up.

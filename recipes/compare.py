@@ -3,8 +3,8 @@
     python -m recipes.compare scenes=gpudrive scenes.train=DIR scenes.eval=DIR
     make demo                                         # the same on SUMO scenes, in minutes
 
-For every seed: pre-train a reference, collect and rank its rollouts, align it with each method, choose each one's decoding
-on the tuning scenes, and evaluate once. Run the same command again to go on after a kill.
+For every seed: pre-train a reference, collect and rank its rollouts, align it with each method, choose each one's
+decoding on the tuning scenes, and evaluate once. Run the same command again to go on after a kill.
 """
 
 from __future__ import annotations
@@ -159,7 +159,9 @@ def compare(cfg: DictConfig) -> dict[str, Any]:
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.compare``."""
     comparison = compare(cfg)
-    print_table(comparison["rows"], comparison["paired"])
+    print_table(comparison["rows"], comparison["paired"], title="At the common top-p")
+    own = comparison["own_best"]
+    print_table(own["rows"], own["paired"], title="Each at its own best top-p, chosen on the tuning scenes")
     print(f"report: {Path(cfg.output) / 'index.html'}")
 
 

@@ -15,8 +15,8 @@ from omegaconf import DictConfig
 from dpa.ranking import PreferenceDistance
 from dpa.realism import mean_result, realism
 from dpa.rollout import Decoding, collect_groups, lifted, simulated_poses
-from envs.progress import progress
 from envs import keys
+from envs.progress import progress
 from envs.scene import CURRENT_STEP
 from envs.store import SceneStore
 from recipes.cli import CONFIG, build, finished, plain, recipe, write_json
@@ -24,7 +24,7 @@ from recipes.models import open_policy, weights_digest
 from recipes.scenes import fingerprint, open_splits
 
 STANDING, MOVED = 0.5, 2.0
-"""An agent whose log moves less than the first stands; one that a rollout moves more than the second is on the move [m]."""
+"""An agent whose log moves less than the first stands; one that a rollout moves more than the second does not [m]."""
 SCENE_FIGURES = (
     "realism",
     "kinematic",
@@ -51,8 +51,8 @@ def evaluate(cfg: DictConfig, scenes: SceneStore, policy: Path, top_p: float, se
         path: JSON to write.
 
     Returns:
-        ``options``, ``mean`` (each figure of :data:`SCENE_FIGURES`), ``likelihood`` (of each realism feature), ``scenes`` (ids) and
-        ``per_scene`` (each figure as a list).
+        ``options``, ``mean`` (each figure of :data:`SCENE_FIGURES`), ``likelihood`` (of each realism feature), ``scenes``
+        (ids) and ``per_scene`` (each figure as a list).
     """
     options = cfg.evaluation
     model, context, _ = open_policy(policy, cfg.device)

@@ -17,12 +17,12 @@ from omegaconf import DictConfig
 
 from dpa.losses import NextTokenLoss, token_network
 from dpa.policy import MotionLM, make_context
-from dpa.training.batches import Item, ShuffledOrder, collate_items, crop_agents, log_item
+from dpa.training.batches import Item, ShuffledOrder, collate_items, crop_agents, log_item, micro_batches
 from dpa.training.optim import clip_and_step, make_optimizer, make_schedule
-from envs.progress import progress
 from dpa.training.run import Run
 from dpa.training.seeding import make_generator, seed_everything
 from envs.augment import mirror
+from envs.progress import progress
 from envs.scene import SceneSource
 from recipes.cli import CONFIG, plain, recipe
 from recipes.models import build_policy, context_options, policy_config, write_policy
@@ -66,9 +66,8 @@ def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path) -> Path:
     with run:
         for step in run.steps():
             crop = make_generator(seed, "crop", step)
-            batch = collate_items([crop_agents(train[i], options.max_agents, crop) for i in order(step)])
-            losses = loss(batch.to(cfg.device))
-            losses["loss_next_token"].backward()
+            items = [crop_agents(train[i], options.max_agents, crop) for i in order(step)]
+            losses = accumulate(loss, items, options.max_rows, cfg.device)
             norm = clip_and_step(optimizer, options.max_norm, schedule)
             run.log({f"train/{key}": value for key, value in losses.items()} | {"train/gradient_norm": norm})
             if (step + 1) % options.tune_interval == 0 or step + 1 == options.steps:
@@ -79,6 +78,18 @@ def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path) -> Path:
                     best.load_state_dict(model.state_dict())
     write_policy(path, best, config, {"method": "reference", "seed": seed, "tune_nll": run.state["best_nll"]})
     return path
+
+
+def accumulate(loss: NextTokenLoss, items: list[Item], max_rows: int, device: str) -> dict[str, torch.Tensor]:
+    """Gradients of the mean loss over items, part by part; returns the mean of each figure."""
+    means: dict[str, torch.Tensor] = {}
+    for part in micro_batches([item.tokens.shape[1] for item in items], max_rows):
+        losses = loss(collate_items([items[i] for i in part]).to(device))
+        share = len(part) / len(items)
+        (share * losses["loss_next_token"]).backward()
+        for key, value in losses.items():
+            means[key] = means.get(key, 0) + share * value.detach()
+    return means
 
 
 def log_items(scenes: SceneSource, cfg: DictConfig, model: MotionLM, *, mirrored: bool, name: str) -> list[Item]:

@@ -55,57 +55,57 @@ def summarise_comparison(
 ) -> dict[str, Any]:
     """The content of ``comparison.json``.
 
-    Rows at the common top-p come first, then those of methods whose own best top-p is another one. A paired entry compares
-    like with like: common with common, and own best with the reference's own best.
+    ``rows`` and ``paired`` compare at the common top-p, and show the reference at its own best one beside them: sharper
+    sampling alone can pass for alignment. ``own_best`` compares every method at its own best top-p with the reference
+    at its own.
     """
     common, methods = cfg.decoding.common, [REFERENCE, *cfg.methods]
-    at = [(method, common) for method in methods] + [(m, best[m]) for m in methods if best[m] != common]
+    sharpest = [(REFERENCE, best[REFERENCE])] if best[REFERENCE] != common else []
+    at_common, at_best = [(m, common) for m in methods], [(m, best[m]) for m in methods]
     results = {
         (method, top_p, seed): json.loads(result_of(seed, method, "eval", top_p).read_text(encoding="utf-8"))
-        for method, top_p in {*at, *((m, best[m]) for m in methods)}
+        for method, top_p in {*at_common, *at_best}
         for seed in cfg.seeds
     }
 
-    def realism(method: str, top_p: float) -> dict[str, list[float]]:
-        return {str(seed): results[method, top_p, seed]["per_scene"]["realism"] for seed in cfg.seeds}
+    def rows(runs: list[tuple[str, float]]) -> list[dict[str, Any]]:
+        return [
+            {
+                "method": method,
+                "seed": seed,
+                "top_p": top_p,
+                **{name: results[method, top_p, seed]["mean"][name] for name in FIGURES},
+                "pair_accuracy": _pair_accuracy(result_of(seed, method, "eval", top_p).parent),
+                "n_scenes": len(results[method, top_p, seed]["scenes"]),
+            }
+            for method, top_p in runs
+            for seed in cfg.seeds
+        ]
 
-    rows = [
-        {
-            "method": method,
-            "seed": seed,
-            "top_p": top_p,
-            **{name: results[method, top_p, seed]["mean"][name] for name in FIGURES},
-            "pair_accuracy": _pair_accuracy(result_of(seed, method, "eval", top_p).parent),
-            "n_scenes": len(results[method, top_p, seed]["scenes"]),
+    def paired(runs: list[tuple[str, float]], reference: tuple[str, float]) -> list[dict[str, Any]]:
+        scores = {
+            run: {str(seed): results[*run, seed]["per_scene"]["realism"] for seed in cfg.seeds}
+            for run in (reference, *runs)
         }
-        for method, top_p in at
-        for seed in cfg.seeds
-    ]
-    paired = [
-        {**entry, "top_p": common, "against": common}
-        for entry in compare_methods({m: realism(m, common) for m in methods}, REFERENCE)
-    ]
-    own = [m for m in methods if m != REFERENCE]
-    best_paired = [
-        {**entry, "top_p": best[entry["method"]], "against": best[REFERENCE]}
-        for entry in compare_methods({m: realism(m, best[m]) for m in (REFERENCE, *own)}, REFERENCE)
-    ]
-    sharper = []
-    if best[REFERENCE] != common:
-        name = f"{REFERENCE} at its best top-p"
-        entry = compare_methods(
-            {REFERENCE: realism(REFERENCE, common), name: realism(REFERENCE, best[REFERENCE])}, REFERENCE
+        found = compare_methods(
+            {f"{m} {p}": score for (m, p), score in scores.items()}, f"{reference[0]} {reference[1]}"
         )
-        sharper = [{**entry[0], "method": REFERENCE, "top_p": best[REFERENCE], "against": common}]
+        return [
+            {**entry, "method": method, "top_p": top_p, "against": reference[1]}
+            for (method, top_p), entry in zip(runs, found, strict=True)
+        ]
+
     return {
         "metric": cfg.evaluation.metric,
         "scenes": {**splits.sizes(), "source": cfg.scenes.source},
         "seeds": list(cfg.seeds),
-        "rows": rows,
-        "paired": paired + sharper,
-        "paired_own_best": best_paired,
-        "top_p": {"common": common, "own_best": best},
-        "per_scene": {m: realism(m, common) for m in methods},
+        "rows": rows(at_common + sharpest),
+        "paired": paired(at_common[1:] + sharpest, at_common[0]),
+        "own_best": {"rows": rows(at_best), "paired": paired(at_best[1:], at_best[0])},
+        "per_scene": {
+            method: {str(seed): results[method, common, seed]["per_scene"]["realism"] for seed in cfg.seeds}
+            for method in methods
+        },
         "stages": stages,
         "wall_seconds": sum(stages.values()),
         "versions": {"python": sys.version.split()[0], **{name: version(name) for name in PACKAGES}},
@@ -120,6 +120,7 @@ def write_report(cfg: DictConfig, splits: Splits, comparison: dict[str, Any]) ->
     if cfg.json is not None:
         write_json(cfg.json, comparison)
     plot_comparison(comparison, folder / "comparison.png")
+    plot_comparison(comparison["own_best"], folder / "own_best.png")
     seed = cfg.seeds[0]
     runs = {method: read_curves(folder / f"seed_{seed}" / method) for method in cfg.methods}
     plot_curves({m: {k: v for k, v in run.items() if k in CURVES} for m, run in runs.items()}, folder / "curves.png")

@@ -98,7 +98,7 @@ class VerletTokenizer(MotionTokenizer):
         bins = (last_bins + change).clamp(-MAX_BIN, MAX_BIN)
         last, end = (self._to_own_frame(b * self.bins[kind], recent) for b in (last_bins, bins))
         xy = self._interpolate(last, end)
-        return torch.cat((xy, self._headings(xy, end, kind)[..., None]), -1)
+        return torch.cat((xy, self._headings(xy, kind)[..., None]), -1)
 
     def _last_bins(self, recent: Tensor, kind: Tensor) -> Tensor:
         """``[*, 2]``: displacement of the last decision in bins, in the frame that is measured in."""
@@ -124,10 +124,11 @@ class VerletTokenizer(MotionTokenizer):
         start = (last + end) / 2
         return (share * start[..., None, :]) + share**2 * (end - start)[..., None, :]
 
-    def _headings(self, xy: Tensor, end: Tensor, kind: Tensor) -> Tensor:
+    def _headings(self, xy: Tensor, kind: Tensor) -> Tensor:
         """``[*, F]``: the heading follows the motion, no faster than ``turn``; standing holds it, reversing keeps it."""
         moves = torch.diff(xy, dim=-2, prepend=torch.zeros_like(xy[..., :1, :]))
-        backward = (end[..., 0] < 0)[..., None]
+        # Move by move: whoever brakes to a stop at constant acceleration rolls back a little at the end.
+        backward = moves[..., 0] < 0
         direction = torch.atan2(moves[..., 1], moves[..., 0]) + torch.pi * backward
         limit = self.turn[kind][..., None] * moves.norm(dim=-1)
         heading, headings = torch.zeros_like(direction[..., 0]), []

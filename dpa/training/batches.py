@@ -76,6 +76,33 @@ def collate_items(items: Sequence[Item]) -> TensorDict:
     )
 
 
+def micro_batches(sizes: Sequence[int], max_rows: int) -> list[list[int]]:
+    """Split a batch into parts of similar size, so that little is padded; accumulate gradients over them.
+
+    Weigh the loss of each part by its share of the items, and the sum is the mean over items.
+
+    Args:
+        sizes: rows of each item (rollouts x agents).
+        max_rows: bound on the padded rows of a part; a single item may exceed it.
+
+    Returns:
+        Positions in ``sizes``, part by part, small items first.
+
+    Examples:
+        >>> micro_batches([10, 2, 9, 2], max_rows=20)
+        [[1, 3], [2, 0]]
+    """
+    parts: list[list[int]] = []
+    for position in sorted(range(len(sizes)), key=lambda i: (sizes[i], i)):
+        # A part holds items of up to twice the size of its smallest one: half of it is padding at worst.
+        smallest = sizes[parts[-1][0]] if parts else 0
+        if parts and (len(parts[-1]) + 1) * sizes[position] <= max_rows and sizes[position] <= 2 * smallest:
+            parts[-1].append(position)
+        else:
+            parts.append([position])
+    return parts
+
+
 class ShuffledOrder:
     """Which items a step takes: a new permutation every epoch, decided by the seed alone.
 

@@ -1,0 +1,93 @@
+"""Measure what tokenization loses: the logs of scenes, tokenized and decoded again, against the logs.
+
+python -m recipes.tokens scenes=gpudrive scenes.train=DIR scenes.eval=DIR json=runs/tokens.json
+python -m recipes.tokens model.tokenizer.interpolation=linear
+"""
+
+from __future__ import annotations
+
+import hydra
+import torch
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.table import Table
+
+from dpa.policy import ContextOptions, make_context
+from dpa.tokens import MotionTokenizer
+from envs.geometry.frames import wrap_angle
+from envs.progress import progress
+from envs.scene import STEP_SECONDS, AgentKind, SceneSource
+from recipes.cli import CONFIG, plain, recipe, write_json
+from recipes.models import build_policy, context_options, policy_config
+from recipes.scenes import open_splits
+
+CLASSES = (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST)
+MOVING = 1.0
+"""An agent that its log moves further than this in the episode [m]."""
+
+
+def reconstruction_errors(
+    scenes: SceneSource, tokenizer: MotionTokenizer, options: ContextOptions
+) -> dict[str, dict[str, float]]:
+    """Errors of each class over all poses that tokens were encoded from.
+
+    Returns:
+        For each class, all agents and moving ones: number of ``poses``, mean and 99th percentile of the displacement
+        ``position_mean`` and ``position_p99`` [m], ``heading_mean`` [degrees] and ``speed_mean`` [m/s].
+    """
+    found: dict[str, list[torch.Tensor]] = {}
+    for index in progress(range(len(scenes)), "tokens", unit="scene"):
+        context = make_context(scenes[index], options)
+        tracks = tokenizer.encode_tracks(context.logged, context.logged_valid, context.recent, context.kind)
+        valid = context.logged_valid & tracks.valid.repeat_interleave(tokenizer.steps, -1)
+        error = (tracks.poses - context.logged)[..., :2].norm(dim=-1)
+        heading = wrap_angle(tracks.poses[..., 2] - context.logged[..., 2]).abs().rad2deg()
+        speed = [p[..., :2].diff(dim=-2).norm(dim=-1) / STEP_SECONDS for p in (tracks.poses, context.logged)]
+        speed_error = torch.nn.functional.pad((speed[0] - speed[1]).abs(), (1, 0))
+        both = torch.nn.functional.pad(valid[:, 1:] & valid[:, :-1], (1, 0))
+        away = ((context.logged - context.recent[:, -1:])[..., :2].norm(dim=-1) * context.logged_valid).amax(-1)
+        for kind in CLASSES:
+            for name, chosen in (("all", context.kind == kind), ("moving", (context.kind == kind) & (away > MOVING))):
+                rows = valid[chosen]
+                sums = found.setdefault(f"{kind.name.lower()} {name}", [])
+                sums.append(
+                    torch.stack(
+                        (
+                            error[chosen][rows],
+                            heading[chosen][rows],
+                            torch.where(both[chosen], speed_error[chosen], torch.nan)[rows],
+                        )
+                    )
+                )
+    return {name: _statistics(torch.cat(parts, -1)) for name, parts in found.items()}
+
+
+def _statistics(values: torch.Tensor) -> dict[str, float]:
+    if values.shape[-1] == 0:
+        return {"poses": 0}
+    position, heading, speed = values
+    # torch.quantile refuses more than 2**24 values; a sort of one row is as good.
+    return {
+        "poses": len(position),
+        "position_mean": position.mean().item(),
+        "position_p99": position.sort().values[int(0.99 * (len(position) - 1))].item(),
+        "heading_mean": heading.mean().item(),
+        "speed_mean": speed.nanmean().item(),
+    }
+
+
+@hydra.main(**CONFIG, config_name="tokens")
+@recipe
+def main(cfg: DictConfig) -> None:
+    """Entry point of ``python -m recipes.tokens``."""
+    model, scenes = build_policy(policy_config(cfg.model)), getattr(open_splits(cfg.scenes), cfg.split)
+    errors = reconstruction_errors(scenes, model.tokenizer, context_options(cfg.model))
+    table = Table("agents", "poses", "position mean [m]", "p99 [m]", "heading mean [deg]", "speed mean [m/s]")
+    for name, row in errors.items():
+        table.add_row(name, *(f"{value:.3f}" if isinstance(value, float) else str(value) for value in row.values()))
+    Console().print(table)
+    write_json(cfg.json, {"tokenizer": plain(cfg.model.tokenizer), "scenes": len(scenes), "errors": errors})
+
+
+if __name__ == "__main__":
+    main()
