@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -155,6 +155,7 @@ def collect_groups(
     indices: Sequence[int],
     *,
     num_rollouts: int,
+    done: Collection[int] = (),
     decoding: Decoding | None = None,
     options: ContextOptions | None = None,
     seed: int = 0,
@@ -164,14 +165,15 @@ def collect_groups(
 ) -> Iterator[TensorDict]:
     """Roll out scenes group by group, each group in one collector batch.
 
-    A group's seed depends on its scenes alone, so what is left of an interrupted collection comes out as it would have
-    if the groups are the same.
+    The groups depend on ``indices`` and a group's seed on its scenes, so what is left of an interrupted collection comes
+    out as it would have: ask for the same indices again, with those that are ``done``.
 
     Args:
         scenes: all scenes.
         model: what drives.
         indices: scenes to roll out.
         num_rollouts: K.
+        done: scenes that are not needed; a group is left out when all its scenes are.
         decoding: how tokens are drawn.
         options: how scenes are cut up.
         seed: of the sampling.
@@ -183,6 +185,8 @@ def collect_groups(
         What the collector gives for each group; ``scene`` holds indices into ``scenes``.
     """
     for group in groups_by_size(scenes, indices, max_rows, num_rollouts):
+        if all(index in done for index in group):
+            continue
         part = Subset(scenes, group)
         collector = make_collector(
             part,

@@ -13,6 +13,9 @@ from tqdm import tqdm
 LOG_INTERVAL = 10.0
 """Seconds between two lines of a bar that does not go to a terminal."""
 
+_line: int | None = None
+"""Terminal line of this process's bars, below that of the process that started it; None lets tqdm choose."""
+
 _stages: ContextVar[tuple[str, ...]] = ContextVar("stages", default=())
 
 
@@ -29,6 +32,18 @@ class _Lines:
 
     def flush(self) -> None:
         self.stream.flush()
+
+
+def use_line(line: int, lock: object) -> None:
+    """Give the bars of this process a terminal line of their own, for processes that draw at the same time.
+
+    Args:
+        line: 0 for the process that starts the others; its bars stay when they end, those below it are erased.
+        lock: shared by all the processes that draw.
+    """
+    global _line
+    _line = line
+    tqdm.set_lock(lock)
 
 
 @contextmanager
@@ -97,8 +112,8 @@ def progress(
         file=stream if terminal else _Lines(stream),
         mininterval=0.2 if terminal else LOG_INTERVAL,
         # Plain lines have no cursor to move: every bar writes at position 0.
-        position=None if terminal else 0,
-        leave=None if terminal else True,
+        position=_line if terminal else 0,
+        leave=not _line if terminal else True,
         ascii=not terminal,
         ncols=None if terminal else 100,
         dynamic_ncols=terminal,

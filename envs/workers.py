@@ -79,11 +79,15 @@ def _start_worker(made: Any) -> None:
     global _made
     _made = made
     torch.set_num_threads(1)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
 
 
-def _end_with_parent() -> None:
-    """A killed parent cannot tell its workers to stop, and they would wait for tasks for ever."""
+def end_with_parent() -> None:
+    """Called in a worker: end it when its parent is killed, which could not tell it to stop."""
+    threading.Thread(target=_wait_for_parent, daemon=True).start()
+
+
+def _wait_for_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 import torch
 
-from envs.progress import progress, stage
+from envs.progress import progress, stage, use_line
+from envs.workers import end_with_parent
 
 
 class Job(NamedTuple):
@@ -40,14 +41,16 @@ def run_jobs(jobs: list[Job], workers: int, threads: int, name: str) -> None:
     """
     if workers < 1:
         raise ValueError(f"workers must be 1 or more, got {workers}.")
+    if workers == 1:
+        for job in progress(jobs, name, unit="job"):
+            _work(job, threads)
+        return
+    # Forking a process that has run torch threads can hang, so workers start fresh.
+    context = multiprocessing.get_context("spawn")
+    started, lock = context.Value("i", 0), context.RLock()
+    use_line(0, lock)
     with progress(total=len(jobs), description=name, unit="job") as bar:
-        if workers == 1:
-            for job in jobs:
-                _work(job, threads)
-                bar.update()
-            return
-        # Forking a process that has run torch threads can hang, so workers start fresh.
-        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        with ProcessPoolExecutor(workers, context, _start, (lock, started)) as pool:
             futures = [pool.submit(_work, job, threads) for job in jobs]
             try:
                 for future in as_completed(futures):
@@ -56,6 +59,14 @@ def run_jobs(jobs: list[Job], workers: int, threads: int, name: str) -> None:
             except BaseException:
                 pool.shutdown(cancel_futures=True)
                 raise
+
+
+def _start(lock: Any, started: Any) -> None:
+    """End with the parent, and draw on a line of the terminal of one's own, below the bar of all jobs."""
+    end_with_parent()
+    with started.get_lock():
+        started.value += 1
+        use_line(started.value, lock)
 
 
 def _work(job: Job, threads: int) -> None:

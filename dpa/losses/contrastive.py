@@ -162,7 +162,7 @@ class ContrastivePreferenceLoss(LossModule):
             likelier = torch.gt(*self._reduce(log_prob, valid).chunk(2, 1))
             out |= _pair_diagnostics(logit.detach())
             out |= {"pair_accuracy": likelier.to(logit.dtype).mean(), "nll_preferred": nll.detach()}
-            out |= {"nll_unpreferred": nll_unpreferred, "entropy": masked_mean(_entropy(logits), valid), **drift}
+            out |= {"nll_unpreferred": nll_unpreferred.detach(), "entropy": masked_mean(_entropy(logits), valid), **drift}
         return TensorDict(out, batch_size=[])
 
     def _reduce(self, value: Tensor, valid: Tensor) -> Tensor:

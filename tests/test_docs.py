@@ -1,0 +1,209 @@
+"""What the documents say is so: their code runs, their commands exist, their links lead somewhere."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import re
+import shlex
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from dpa.ranking import AGGREGATES, FEATURES, SOLVERS
+from envs import keys
+from envs.convert import _parser as convert_parser
+from envs.sources import SOURCES
+from envs.sources.sumo import parse, units
+from recipes.align import LOSSES
+from recipes.models import TOKENIZERS
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+CONFIG = REPOSITORY / "recipes" / "config"
+PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
+COMMANDED = [*PAGES, *sorted(CONFIG.rglob("*.yaml")), *sorted((REPOSITORY / "recipes").glob("*.py"))]
+"""Files that tell users what to run."""
+NOT_RUN = "<!-- not run by tests/test_docs.py"
+REGISTRIES = (AGGREGATES, FEATURES, LOSSES, SOLVERS, SOURCES, TOKENIZERS)
+"""What examples add to."""
+
+
+class Block(NamedTuple):
+    """A fenced block of a page."""
+
+    language: str
+    code: str
+    runs: bool
+
+
+def blocks(page: Path) -> list[Block]:
+    text = page.read_text(encoding="utf-8")
+    found = re.finditer(r"(?:(<!--[^\n]*-->)\n)?^```(\w*)\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
+    return [Block(m[2], m[3], not (m[1] or "").startswith(NOT_RUN)) for m in found]
+
+
+def name(path: Path) -> str:
+    return str(path.relative_to(REPOSITORY))
+
+
+def commands() -> list[tuple[str, str]]:
+    """File and command line, from the module on: ``recipes.align method=dpa_omf ...``."""
+    found = []
+    for path in COMMANDED:
+        for line in path.read_text(encoding="utf-8").splitlines():
+            for match in re.finditer(r"python -m ((?:recipes|envs|dpa)\.?[\w.]*[^`#)]*)", line):
+                # Prose goes on after a comma or a colon; a comment stands two spaces away.
+                ends = r"\s{2,}|[:;,]\s|[:,.]$|\.\.\." + ('|"' if path.suffix == ".py" else "")
+                command = re.split(ends, match[1])[0].strip()
+                found.append((name(path), command))
+    return sorted(set(found))
+
+
+COMMANDS = commands()
+
+
+@pytest.fixture
+def registries():
+    """Examples register things; other tests must not find them."""
+    before = [dict(registry) for registry in REGISTRIES]
+    yield
+    for registry, content in zip(REGISTRIES, before, strict=True):
+        registry.clear()
+        registry.update(content)
+
+
+@pytest.mark.usefixtures("registries")
+@pytest.mark.parametrize("page", [p for p in PAGES if any(b.language == "python" for b in blocks(p))], ids=name)
+def test_the_python_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    namespace = {"__name__": "documentation"}
+    for number, block in enumerate(blocks(page)):
+        if block.language == "python":
+            code = compile(block.code, f"{page.name}[{number}]", "exec", dont_inherit=True)
+            if block.runs:
+                exec(code, namespace)
+
+
+def test_commands_are_found() -> None:
+    modules = {command.split()[0] for _, command in COMMANDS}
+    assert {"recipes.pretrain", "recipes.compare", "envs.convert", "envs.render", "dpa.preferences"} <= modules
+
+
+@pytest.mark.parametrize(("path", "command"), COMMANDS)
+def test_a_command_names_a_module_that_can_be_run(path: str, command: str) -> None:
+    spec = importlib.util.find_spec(command.split()[0])
+    assert spec is not None
+    main = Path(spec.origin).with_name("__main__.py") if spec.submodule_search_locations else Path(spec.origin)
+    assert 'if __name__ == "__main__":' in main.read_text(encoding="utf-8")
+
+
+@functools.cache
+def page_configurations() -> dict[str, str]:
+    """YAML files that the pages tell to write, by name below ``recipes/config``."""
+    found = {}
+    for page in PAGES:
+        for block in blocks(page):
+            header = re.match(r"# recipes/config/(\S+)\n", block.code)
+            if block.language == "yaml" and header:
+                found[header[1]] = block.code
+    return found
+
+
+@pytest.fixture(scope="module")
+def extra_configurations(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the YAML files of the pages, as if they had been written."""
+    folder = tmp_path_factory.mktemp("config")
+    for path, text in page_configurations().items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_text(text, encoding="utf-8")
+    return folder
+
+
+@pytest.mark.parametrize(("path", "command"), [c for c in COMMANDS if c[1].startswith("recipes.")])
+def test_a_recipe_takes_the_options_that_a_command_gives(path: str, command: str, extra_configurations: Path) -> None:
+    module, *arguments = shlex.split(command)
+    overrides, config = [], module.partition(".")[2]
+    while arguments:
+        word = arguments.pop(0)
+        if word in ("--config-name", "--cfg"):
+            value = arguments.pop(0)
+            config = value if word == "--config-name" else config
+        elif not word.startswith("--"):
+            overrides.append(word)
+    with initialize_config_dir(str(CONFIG), version_base="1.3"):
+        cfg = compose(config, [f"hydra.searchpath=[file://{extra_configurations}]", *overrides])
+    OmegaConf.resolve(cfg)
+    if cfg.scenes.source == "sumo":
+        assert all(units(**parse(request)) for request in (cfg.scenes.train, cfg.scenes.eval))
+
+
+@pytest.mark.parametrize(
+    "command", sorted({c for _, c in COMMANDS if re.match(r"envs\.convert \S+ \S", c) and " npz " not in c})
+)
+def test_a_conversion_takes_the_options_that_a_command_gives(command: str) -> None:
+    options = vars(convert_parser().parse_args(shlex.split(command)[1:]))
+    if options["command"] == "sumo":
+        assert all(units(**parse(request)) for request in options["paths"])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_every_make_target_exists(page: Path) -> None:
+    makefile = (REPOSITORY / "Makefile").read_text(encoding="utf-8")
+    targets = set(re.findall(r"^([\w-]+):", makefile, re.MULTILINE))
+    named = re.findall(r"(?:^    |`)make ([a-z][\w-]*)", page.read_text(encoding="utf-8"), re.MULTILINE)
+    assert set(named) <= targets
+
+
+def anchors(page: Path) -> set[str]:
+    """Names of a page's headings as links use them."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", [*PAGES, REPOSITORY / "CHANGELOG.md"], ids=name)
+def test_every_relative_link_leads_somewhere(page: Path) -> None:
+    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    broken = []
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        path, _, anchor = target.partition("#")
+        if re.match(r"[a-z]+:", target):
+            continue
+        file = (page.parent / path).resolve() if path else page
+        if not file.exists() or (anchor and anchor not in anchors(file)):
+            broken.append(target)
+    assert not broken
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_every_file_that_is_named_exists(page: Path) -> None:
+    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    named = re.findall(r"`((?:envs|dpa|recipes|tests|docs)/[\w./-]+)`", text)
+    assert not [path for path in named if not (REPOSITORY / path).exists()]
+
+
+def test_the_page_of_keys_lists_every_key() -> None:
+    text = (REPOSITORY / "docs" / "keys.md").read_text(encoding="utf-8")
+    constants = [constant for constant in vars(keys) if constant.isupper()]
+    assert constants
+    assert not [constant for constant in constants if f"`{constant}`" not in text]
+
+
+def test_readme_and_architecture_show_the_same_flow() -> None:
+    first, second = (
+        next(block.code for block in blocks(REPOSITORY / page) if block.language == "text")
+        for page in ("README.md", "docs/architecture.md")
+    )
+    assert first == second
+
+
+def test_pictures_of_the_documents_are_small() -> None:
+    pictures = sorted((REPOSITORY / "docs" / "images").iterdir())
+    assert pictures
+    assert not [picture.name for picture in pictures if picture.stat().st_size > 150_000]
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])
