@@ -71,6 +71,8 @@ RANK: NestedKey = "rank"
 """``[S, K]`` int64: 0 is the nearest rollout."""
 
 # --- what a loss reads ----------------------------------------------------------------------------------------------
+LABELS: NestedKey = "labels"
+"""``[S, M, A, T]`` int64: tokens to predict, those of ``tokens`` or, after noise, those that lead back to the log."""
 PREFERRED: NestedKey = "preferred"
 """``[S, M, A, T]`` int64: tokens of the preferred rollouts of a batch of pairs."""
 UNPREFERRED: NestedKey = "unpreferred"

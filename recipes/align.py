@@ -52,13 +52,15 @@ def align(
         The file of the aligned policy.
 
     Raises:
-        ValueError: preferences of other scenes, an unknown loss, or options that do not fit it.
+        ValueError: preferences of other scenes or of another policy, an unknown loss, or options that do not fit it.
     """
     options, path = cfg.alignment, folder / "policy.pt"
     model, context, config = open_policy(policy, cfg.device)
     store = PreferenceStore(preferences)
     if store.provenance.scenes != fingerprint(scenes):
         raise ValueError(f"{preferences} ranks rollouts of other scenes; collect again with the scenes at hand.")
+    if store.provenance.policy != weights_digest(model):
+        raise ValueError(f"{preferences} ranks rollouts of another policy; collect again with {policy}.")
     decided_by = {
         "method": plain(method),
         "alignment": plain(options),

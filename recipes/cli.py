@@ -16,8 +16,8 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-CONFIG = {"version_base": "1.3", "config_path": "config"}
-"""Arguments of ``hydra.main`` that all recipes share."""
+CONFIG = {"version_base": "1.3", "config_path": str(Path(__file__).parent / "config")}
+"""Arguments of ``hydra.main`` that all recipes share. An absolute path, so that ``main`` may also be imported and called."""
 USER_ERRORS = (ValueError, OSError, ImportError, FloatingPointError, HydraException, OmegaConfBaseException)
 
 
@@ -54,6 +54,10 @@ def build(target: Callable[..., Any], section: DictConfig, name: str, *args: Any
     unknown = sorted(set(options) - set(known))
     if unknown:
         raise ValueError(f"{name} has no option {unknown[0]!r}; it takes {', '.join(known)}.")
+    try:
+        signature(target).bind(*args, **options, **fixed)
+    except TypeError as error:
+        raise ValueError(f"{name} {error}.") from None
     return target(*args, **options, **fixed)
 
 
@@ -74,14 +78,18 @@ def finished(path: Path, decided_by: dict[str, Any]) -> dict[str, Any] | None:
         decided_by: the options of this run.
 
     Raises:
-        ValueError: the result is of other options.
+        ValueError: the result is of other options, or the file is none.
     """
     if not path.is_file():
         return None
-    content = json.loads(path.read_text(encoding="utf-8"))
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        options = content["options"]
+    except (ValueError, LookupError, TypeError) as error:
+        raise ValueError(f"{path} is no result of this recipe ({error}); remove it, or name another file.") from None
     now = json.loads(json.dumps(decided_by))
-    if content["options"] != now:
-        differ = sorted(k for k in now | content["options"] if now.get(k) != content["options"].get(k))
+    if options != now:
+        differ = sorted(k for k in now | options if now.get(k) != options.get(k))
         raise ValueError(
             f"{path} was written with other options ({', '.join(differ)}); name another output folder, or remove it."
         )

@@ -17,6 +17,7 @@ from dpa.preferences import PreferenceStore, PreferenceWriter, Provenance
 from dpa.ranking import PreferenceDistance
 from dpa.ranking.transform import RankRollouts
 from dpa.rollout import Decoding, collect_groups
+from envs import keys
 from envs.progress import progress
 from envs.store import SceneStore
 from recipes.cli import CONFIG, build, plain, recipe
@@ -48,14 +49,14 @@ def collect(cfg: DictConfig, scenes: SceneStore, policy: Path, seed: int, folder
         vocab_size=model.tokenizer.vocab_size,
     )
     with PreferenceWriter(folder, provenance, chunk_scenes=options.chunk_scenes) as writer:
-        left = [index for index in range(len(scenes)) if index not in writer.scenes_done]
-        bar = progress(total=len(scenes), description="collect", initial=len(scenes) - len(left), unit="scene")
-        with bar:
+        done = writer.scenes_done
+        with progress(total=len(scenes), description="collect", initial=len(done), unit="scene") as bar:
             for groups in collect_groups(
                 scenes,
                 model,
-                left,
+                range(len(scenes)),
                 num_rollouts=options.num_rollouts,
+                done=done,
                 decoding=build(Decoding, options.decoding, "collection.decoding"),
                 options=context,
                 seed=seed,
@@ -63,6 +64,7 @@ def collect(cfg: DictConfig, scenes: SceneStore, policy: Path, seed: int, folder
                 max_rows=options.max_rows,
                 device=cfg.device,
             ):
+                groups = groups[[scene not in done for scene in groups[keys.SCENE].tolist()]]
                 writer.append(groups)
                 bar.update(len(groups))
     return PreferenceStore(folder)
@@ -72,7 +74,7 @@ def collect(cfg: DictConfig, scenes: SceneStore, policy: Path, seed: int, folder
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.collect``."""
-    scenes = getattr(open_splits(cfg.scenes), cfg.split)
+    scenes = open_splits(cfg.scenes)[cfg.split]
     store = collect(cfg, scenes, Path(cfg.policy), cfg.seed, Path(cfg.output))
     print(f"preferences of {len(store)} scenes: {cfg.output}")
 

@@ -38,7 +38,7 @@ def pretrain_job(cfg: DictConfig, seed: int) -> None:
 
 def collect_job(cfg: DictConfig, seed: int, split: str) -> None:
     """Ranked rollouts of one seed's reference on the training scenes, or on the evaluation scenes for pair accuracy."""
-    scenes = getattr(open_splits(cfg.scenes), split)
+    scenes = open_splits(cfg.scenes)[split]
     collect(cfg, scenes, policy_of(cfg, seed, REFERENCE), seed, preferences_of(cfg, seed, split))
 
 
@@ -59,7 +59,7 @@ def evaluate_job(cfg: DictConfig, seed: int, method: str, split: str, top_p: flo
     """One policy at one top-p, on the tuning or the evaluation scenes."""
     if split == "tune":
         cfg = OmegaConf.merge(cfg, {"evaluation": {"num_rollouts": cfg.decoding.num_rollouts}})
-    scenes = getattr(open_splits(cfg.scenes), split)
+    scenes = open_splits(cfg.scenes)[split]
     evaluate(cfg, scenes, policy_of(cfg, seed, method), top_p, seed, result_of(cfg, seed, method, split, top_p))
 
 

@@ -5,22 +5,26 @@ python -m recipes.evaluate policy=runs/pretrain/policy.pt decoding.top_p=0.9 jso
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import hydra
 import torch
 from omegaconf import DictConfig
+from tensordict import TensorDictBase
 
 from dpa.ranking import PreferenceDistance
-from dpa.realism import mean_result, realism
+from dpa.realism import RealismResult, mean_result, realism
 from dpa.rollout import Decoding, collect_groups, lifted, simulated_poses
 from envs import keys
 from envs.progress import progress
-from envs.scene import CURRENT_STEP
+from envs.scene import CURRENT_STEP, SceneSource
 from envs.store import SceneStore
 from recipes.cli import CONFIG, build, finished, plain, recipe, write_json
 from recipes.models import open_policy, weights_digest
+from recipes.partial import PartialResult
 from recipes.scenes import fingerprint, open_splits
 
 STANDING, MOVED = 0.5, 2.0
@@ -40,7 +44,7 @@ SCENE_FIGURES = (
 
 
 def evaluate(cfg: DictConfig, scenes: SceneStore, policy: Path, top_p: float, seed: int, path: Path) -> dict[str, Any]:
-    """Score one policy on some scenes; a finished result of the same options is read back.
+    """Score one policy on some scenes; a finished result of the same options is read back, an unfinished one goes on.
 
     Args:
         cfg: with the sections ``evaluation``, ``collection.ranking`` and ``device``.
@@ -68,44 +72,77 @@ def evaluate(cfg: DictConfig, scenes: SceneStore, policy: Path, top_p: float, se
     if done is not None:
         return done
     distance = build(PreferenceDistance, cfg.collection.ranking, "collection.ranking")
-    figures: dict[int, dict[str, float]] = {}
-    results = {}
-    with progress(total=len(scenes), description=f"evaluate top-p {top_p:g}", unit="scene") as bar:
+    partial = PartialResult(path, decided_by)
+    scored = partial.read()
+    bar = progress(total=len(scenes), description=f"evaluate top-p {top_p:g}", initial=len(scored), unit="scene")
+    with bar:
         for batch in collect_groups(
             scenes,
             model,
             range(len(scenes)),
             num_rollouts=options.num_rollouts,
+            done=frozenset(scored),
             decoding=Decoding(top_p, options.temperature),
             options=context,
             seed=seed,
             max_rows=options.max_rows,
             device=cfg.device,
         ):
-            poses = simulated_poses(batch, options.num_rollouts).cpu()
-            controlled = batch[keys.CONTROLLED][:: options.num_rollouts, 0].cpu()
-            for row, index in enumerate(batch[keys.SCENE][:: options.num_rollouts, 0].tolist()):
-                scene = scenes[index]
-                trajectories = lifted(scene, poses[row])
-                results[index] = realism(scene, trajectories, options.metric)
-                ranking = distance(scene, trajectories, controlled[row, : trajectories.shape[1]])
-                figures[index] = results[index].as_dict() | {
-                    "preference_distance": ranking.distance.mean().item(),
-                    "standing_moved": standing_moved(scene, trajectories),
-                }
-                bar.update()
-    order = sorted(figures)
-    mean = mean_result([results[i] for i in order])
-    per_scene = {name: [_finite(figures[i][name]) for i in order] for name in SCENE_FIGURES}
-    content = {
-        "options": decided_by,
+            fresh = score_group(batch, scenes, distance, options, bar.update)
+            partial.add(fresh)
+            scored |= fresh
+    content = {"options": decided_by, **summarise([scored[i] for i in range(len(scenes))], scenes.scene_ids)}
+    write_json(path, content)
+    partial.remove()
+    return content
+
+
+def score_group(
+    batch: TensorDictBase,
+    scenes: SceneSource,
+    distance: PreferenceDistance,
+    options: DictConfig,
+    tick: Callable[[], object],
+) -> dict[int, dict[str, Any]]:
+    """Score the rollouts of a group of scenes.
+
+    Args:
+        batch: ``[S * K, T]``, from a collector.
+        scenes: that ``scene`` in the batch points to.
+        distance: how far rollouts are from the log.
+        options: the section ``evaluation``.
+        tick: called after each scene.
+
+    Returns:
+        For each scene by index, the :class:`~dpa.realism.RealismResult` as plain numbers and figures of our own.
+    """
+    poses = simulated_poses(batch, options.num_rollouts).cpu()
+    controlled = batch[keys.CONTROLLED][:: options.num_rollouts, 0].cpu()
+    scored = {}
+    for row, index in enumerate(batch[keys.SCENE][:: options.num_rollouts, 0].tolist()):
+        scene = scenes[index]
+        trajectories = lifted(scene, poses[row])
+        ranking = distance(scene, trajectories, controlled[row, : trajectories.shape[1]])
+        scored[index] = {
+            "result": asdict(realism(scene, trajectories, options.metric)),
+            "preference_distance": ranking.distance.mean().item(),
+            "standing_moved": standing_moved(scene, trajectories),
+        }
+        tick()
+    return scored
+
+
+def summarise(scored: list[dict[str, Any]], scene_ids: list[str]) -> dict[str, Any]:
+    """Means over scenes and the figures of each, from what :func:`score_group` gives for each scene."""
+    results = [RealismResult(**entry["result"]) for entry in scored]
+    figures = [result.as_dict() | entry for result, entry in zip(results, scored, strict=True)]
+    per_scene = {name: [_finite(figure[name]) for figure in figures] for name in SCENE_FIGURES}
+    return {
         "mean": {name: _mean(values) for name, values in per_scene.items()},
-        "likelihood": {name: _finite(value) for name, value in mean.likelihood.items()},
-        "scenes": [scenes.scene_ids[i] for i in order],
+        "likelihood": {name: _finite(value) for name, value in mean_result(results).likelihood.items()},
+        "scenes": scene_ids,
         "per_scene": per_scene,
     }
-    write_json(path, content)
-    return content
 
 
 def standing_moved(scene: Any, trajectories: torch.Tensor) -> float:
@@ -138,7 +175,7 @@ def _mean(values: list[float | None]) -> float | None:
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.evaluate``."""
-    scenes = getattr(open_splits(cfg.scenes), cfg.split)
+    scenes = open_splits(cfg.scenes)[cfg.split]
     result = evaluate(cfg, scenes, Path(cfg.policy), cfg.decoding.top_p, cfg.seed, Path(cfg.json))
     width = max(map(len, SCENE_FIGURES))
     for name, value in result["mean"].items():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from typing import Any, NamedTuple
 
 import torch
@@ -37,6 +38,7 @@ def run_jobs(jobs: list[Job], workers: int, threads: int, name: str) -> None:
         name: of the progress bar.
 
     Raises:
+        ChildProcessError: a worker was killed.
         Exception: the first error of a job; jobs that have not started are dropped.
     """
     if workers < 1:
@@ -56,6 +58,10 @@ def run_jobs(jobs: list[Job], workers: int, threads: int, name: str) -> None:
                 for future in as_completed(futures):
                     future.result()
                     bar.update()
+            except BrokenProcessPool as error:
+                raise ChildProcessError(
+                    f"a worker of {name!r} was killed, perhaps for want of memory; run it again with workers=1."
+                ) from error
             except BaseException:
                 pool.shutdown(cancel_futures=True)
                 raise

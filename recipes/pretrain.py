@@ -21,6 +21,7 @@ from dpa.training.batches import Item, ShuffledOrder, collate_items, crop_agents
 from dpa.training.optim import clip_and_step, make_optimizer, make_schedule
 from dpa.training.run import Run
 from dpa.training.seeding import make_generator, seed_everything
+from envs import keys
 from envs.augment import mirror
 from envs.progress import progress
 from envs.scene import SceneSource
@@ -47,9 +48,10 @@ def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path) -> Path:
     seed_everything(seed)
     model = build_policy(config).to(cfg.device)
     best = copy.deepcopy(model)
-    train = log_items(splits.train, cfg, model, mirrored=options.mirror, name="tokens of train scenes")
-    tune = log_items(splits.tune, cfg, model, mirrored=False, name="tokens of tune scenes")
+    train = log_items(splits.train, cfg, model, copies=options.copies, noise=options.noise, mirrored=options.mirror)
+    tune = log_items(splits.tune, cfg, model)
     loss = NextTokenLoss(token_network(model), label_smoothing=options.label_smoothing)
+    loss.set_keys(labels=keys.LABELS)
     optimizer = make_optimizer(model, options.lr, options.weight_decay)
     schedule = make_schedule(optimizer, options.steps, options.warmup)
     order = ShuffledOrder(len(train), options.batch_size, seed)
@@ -92,15 +94,23 @@ def accumulate(loss: NextTokenLoss, items: list[Item], max_rows: int, device: st
     return means
 
 
-def log_items(scenes: SceneSource, cfg: DictConfig, model: MotionLM, *, mirrored: bool, name: str) -> list[Item]:
-    """Tokenized logs of all scenes, and of their mirror images."""
+def log_items(
+    scenes: SceneSource,
+    cfg: DictConfig,
+    model: MotionLM,
+    *,
+    copies: int = 1,
+    noise: float = 0.0,
+    mirrored: bool = False,
+) -> list[Item]:
+    """Tokenized logs of all scenes: ``copies`` with noise of their own, and as many of their mirror images."""
     options, tokenizer = context_options(cfg.model), copy.deepcopy(model.tokenizer).cpu()
     items = []
-    for index in progress(range(len(scenes)), name, unit="scene"):
-        scene = scenes[index]
-        items += [
-            log_item(make_context(s, options), tokenizer) for s in ([scene, mirror(scene)] if mirrored else [scene])
-        ]
+    for index in progress(range(len(scenes)), "tokens", unit="scene"):
+        scene, draw = scenes[index], make_generator(0, "noise", index)
+        for image in [scene, mirror(scene)] if mirrored else [scene]:
+            context = make_context(image, options)
+            items += [log_item(context, tokenizer, noise=noise, generator=draw) for _ in range(copies)]
     return [item for item in items if item.token_valid.any()]
 
 

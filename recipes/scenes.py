@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import torch
@@ -27,6 +27,11 @@ class Splits:
     train: SceneStore
     tune: SceneStore
     eval: SceneStore
+
+    def __getitem__(self, name: str) -> SceneStore:
+        if name not in (names := [field.name for field in fields(self)]):
+            raise ValueError(f"split must be one of {', '.join(names)}, got {name!r}.")
+        return getattr(self, name)
 
     def sizes(self) -> dict[str, int]:
         """Number of scenes of each split."""

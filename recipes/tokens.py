@@ -80,7 +80,7 @@ def _statistics(values: torch.Tensor) -> dict[str, float]:
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.tokens``."""
-    model, scenes = build_policy(policy_config(cfg.model)), getattr(open_splits(cfg.scenes), cfg.split)
+    model, scenes = build_policy(policy_config(cfg.model)), open_splits(cfg.scenes)[cfg.split]
     errors = reconstruction_errors(scenes, model.tokenizer, context_options(cfg.model))
     table = Table("agents", "poses", "position mean [m]", "p99 [m]", "heading mean [deg]", "speed mean [m/s]")
     for name, row in errors.items():

@@ -51,12 +51,14 @@ class NextTokenLoss(LossModule):
 
         Attributes:
             context: :class:`~dpa.policy.SceneContext` of batch size ``[S]``.
-            tokens: ``[S, M, A, T]`` int64.
+            tokens: ``[S, M, A, T]`` int64, what the network reads.
+            labels: ``[S, M, A, T]`` int64, what it is to predict; the tokens themselves by default.
             token_valid: ``[S, M or 1, A, T]`` bool.
         """
 
         context: NestedKey = CONTEXT
         tokens: NestedKey = keys.TOKENS
+        labels: NestedKey = keys.TOKENS
         token_valid: NestedKey = keys.TOKEN_VALID
 
     default_keys = _AcceptedKeys
@@ -76,7 +78,7 @@ class NextTokenLoss(LossModule):
     @property
     def in_keys(self) -> list[NestedKey]:
         accepted = self.tensor_keys
-        return [accepted.context, accepted.tokens, accepted.token_valid]
+        return list(dict.fromkeys((accepted.context, accepted.tokens, accepted.labels, accepted.token_valid)))
 
     def _forward_value_estimator_keys(self, **_: object) -> None:
         """There is no value estimator."""
@@ -91,12 +93,12 @@ class NextTokenLoss(LossModule):
         )
         with self.actor_network_params.to_module(self.actor_network):
             logits = self.actor_network(batch)[LOGITS]
-        log_probs = logits.log_softmax(-1)
-        nll = -log_probs.gather(-1, tokens[..., None])[..., 0]
+        log_probs, labels = logits.log_softmax(-1), tensordict[accepted.labels]
+        nll = -log_probs.gather(-1, labels[..., None])[..., 0]
         spread = -log_probs.mean(-1)
         loss = masked_mean((1 - self.label_smoothing) * nll + self.label_smoothing * spread, valid)
         with torch.no_grad():
-            hit = (logits.argmax(-1) == tokens).to(logits.dtype)
+            hit = (logits.argmax(-1) == labels).to(logits.dtype)
             entropy = -(log_probs.exp() * log_probs).sum(-1)
             diagnostics = {"accuracy": masked_mean(hit, valid), "entropy": masked_mean(entropy, valid)}
         return TensorDict({"loss_next_token": loss, **diagnostics}, batch_size=[])

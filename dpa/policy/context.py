@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from envs.geometry.frames import rotate, to_local, wrap_angle
-from envs.scene import CURRENT_STEP, LOG_STEPS, Lights, LightState, RoadMap, Scene, collate
+from envs.scene import CURRENT_STEP, LOG_STEPS, STEP_SECONDS, Agents, Lights, LightState, RoadMap, Scene, collate
 from envs.traffic import MAX_CONTROLLED, choose_controlled, present_agents
 
 PIECE_POINTS = 5
@@ -23,6 +23,8 @@ PIECE_POINTS = 5
 HISTORY = CURRENT_STEP + 1
 POSITION_SCALE = 10.0
 """Metres that count as one in a feature."""
+REACH_GRID = 4.0
+"""Places nearer to each other than this count as one in the choice of map pieces [m]."""
 NUM_LIGHT_STATES = len(LightState)
 
 
@@ -31,14 +33,14 @@ class ContextOptions:
     """How a scene is cut up for the policy.
 
     Attributes:
-        max_pieces: map pieces kept, those nearest to any agent.
+        max_pieces: map pieces kept, those nearest to where any agent is or may soon be.
         piece_length: target length of a map piece [m].
         max_controlled: agents that the policy moves at most.
         decision_steps: F.
         horizon: T.
     """
 
-    max_pieces: int = 256
+    max_pieces: int = 512
     piece_length: float = 12.0
     max_controlled: int = MAX_CONTROLLED
     decision_steps: int = 5
@@ -101,7 +103,8 @@ def make_context(scene: Scene, options: ContextOptions | None = None) -> SceneCo
     poses, current = agents.poses, agents.poses[:, CURRENT_STEP]
     valid_history = agents.valid[:, :HISTORY]
     future = slice(HISTORY, HISTORY + options.decision_steps * options.horizon)
-    map_pose, map_points, map_kind, map_light = _map_pieces(scene.road, scene.lights, current[:, :2], options)
+    pieces = _map_pieces(scene.road, scene.lights, _reach(agents, options), options)
+    map_pose, map_points, map_kind, map_light = pieces
     light_pose = _light_poses(scene.road, scene.lights)
     return SceneContext(
         map_pose=map_pose,
@@ -144,14 +147,22 @@ def keep_agents(context: SceneContext, index: Tensor) -> SceneContext:
     return context
 
 
+def _reach(agents: Agents, options: ContextOptions) -> Tensor:
+    """``[n, 2]``: where agents are, and where they would be each second of the episode at constant velocity."""
+    seconds = torch.arange(0.0, options.decision_steps * options.horizon * STEP_SECONDS + 0.5)
+    ahead = agents.velocity[:, CURRENT_STEP, None] * seconds[:, None]
+    places = (agents.position[:, CURRENT_STEP, None, :2] + ahead).flatten(0, 1)
+    return torch.unique((places / REACH_GRID).round(), dim=0) * REACH_GRID  # the standing ones count once
+
+
 def _map_pieces(
-    road: RoadMap, lights: Lights, agents: Tensor, options: ContextOptions
+    road: RoadMap, lights: Lights, places: Tensor, options: ContextOptions
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Poses, points, kinds and lights of the pieces nearest to the agents (``[n, 2]``)."""
+    """Poses, points, kinds and lights of the pieces nearest to some places (``[n, 2]``)."""
     owner, start, end = _cut(road, options.piece_length)
     points = _resample(road.points[:, :2], start, end)
     middle = points[:, PIECE_POINTS // 2]
-    near = torch.cdist(middle, agents).amin(1).argsort(stable=True)[: options.max_pieces]
+    near = torch.cdist(middle, places).amin(1).argsort(stable=True)[: options.max_pieces]
     near = near.sort().values  # map order, so that equal scenes give equal tensors
     points, middle, owner = points[near], middle[near], owner[near]
     chord = points[:, -1] - points[:, 0]

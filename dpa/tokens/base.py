@@ -18,11 +18,14 @@ class TokenizedTracks(NamedTuple):
         tokens: ``[*, A, T]`` int64.
         valid: ``[*, A, T]`` bool, the token was encoded from logged poses; false from the first hole of a log on.
         poses: ``[*, A, T * F, 3]``, what the tokens decode to, in the scene's frame.
+        labels: ``[*, A, T]`` int64, the token that comes nearest to the log from where the tokens before have led; it
+            differs from ``tokens`` where noise has replaced it.
     """
 
     tokens: Tensor
     valid: Tensor
     poses: Tensor
+    labels: Tensor
 
 
 class MotionTokenizer(nn.Module):
@@ -56,27 +59,53 @@ class MotionTokenizer(nn.Module):
     def decode(self, token: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
         """The motion of a token: ``[*, F, 3]`` poses in the agent's own current frame (arguments as in encode)."""
 
-    def encode_tracks(self, poses: Tensor, valid: Tensor, recent: Tensor, kind: Tensor) -> TokenizedTracks:
+    @abstractmethod
+    def neighbour(self, token: Tensor, generator: torch.Generator) -> Tensor:
+        """A random token of nearly the same motion as each token ``[*]``, for noisy tokenization."""
+
+    def encode_tracks(
+        self,
+        poses: Tensor,
+        valid: Tensor,
+        recent: Tensor,
+        kind: Tensor,
+        *,
+        noise: float = 0.0,
+        generator: torch.Generator | None = None,
+    ) -> TokenizedTracks:
         """Tokenize tracks greedily on the reconstructed track, so that errors do not add up (METHOD section 2).
 
-        A token is valid up to the first decision in which the log misses its last pose.
+        A token is valid up to the first decision in which the log misses its last pose. With ``noise``, some tokens
+        are replaced by neighbours and the labels lead back to the log: whoever learns the labels learns to recover
+        from its own errors (Philion et al. 2024, section 3.3).
 
         Args:
             poses: ``[*, A, T * F, 3]`` logged poses after the current step.
             valid: ``[*, A, T * F]`` bool.
             recent: ``[*, A, F + 1, 3]``.
             kind: ``[*, A]``.
+
+        Keyword Args:
+            noise: probability with which a token is replaced.
+            generator: of the noise.
         """
         decisions = poses.unflatten(-2, (-1, self.steps))
         ends = valid.unflatten(-1, (-1, self.steps))[..., -1]
         token_valid = ends.cummin(-1).values
-        tokens, tracks = [], []
+        tokens, labels, tracks = [], [], []
         for step in range(decisions.shape[-3]):
             target = to_local(decisions[..., step, :, :], recent[..., -1:, :])
-            tokens.append(self.encode(target, recent, kind))
+            labels.append(self.encode(target, recent, kind))
+            tokens.append(self._noisy(labels[-1], noise, generator))
             recent = self.advance(tokens[-1], recent, kind)
             tracks.append(recent[..., 1:, :])
-        return TokenizedTracks(torch.stack(tokens, -1), token_valid, torch.cat(tracks, -2))
+        return TokenizedTracks(torch.stack(tokens, -1), token_valid, torch.cat(tracks, -2), torch.stack(labels, -1))
+
+    def _noisy(self, token: Tensor, noise: float, generator: torch.Generator | None) -> Tensor:
+        if noise == 0:
+            return token
+        replaced = torch.rand(token.shape, generator=generator, device=token.device) < noise
+        return torch.where(replaced, self.neighbour(token, generator), token)
 
     def decode_tracks(self, tokens: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
         """Poses of a row of tokens.

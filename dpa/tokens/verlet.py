@@ -100,6 +100,12 @@ class VerletTokenizer(MotionTokenizer):
         xy = self._interpolate(last, end)
         return torch.cat((xy, self._headings(xy, kind)[..., None]), -1)
 
+    def neighbour(self, token: Tensor, generator: torch.Generator) -> Tensor:
+        change = torch.stack((token // CHANGES, token % CHANGES), -1)
+        step = torch.randint(-1, 2, change.shape, generator=generator, device=token.device)
+        change = (change + step).clamp(0, CHANGES - 1)
+        return change[..., 0] * CHANGES + change[..., 1]
+
     def _last_bins(self, recent: Tensor, kind: Tensor) -> Tensor:
         """``[*, 2]``: displacement of the last decision in bins, in the frame that is measured in."""
         moved = recent[..., -1, :2] - recent[..., 0, :2]

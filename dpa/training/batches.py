@@ -23,15 +23,25 @@ class Item(NamedTuple):
         context: uncollated.
         tokens: ``[M, A, T]`` int64.
         token_valid: ``[A, T]`` bool.
+        labels: ``[M, A, T]`` int64, what to predict where it is not the tokens themselves (noisy tokenization).
     """
 
     context: SceneContext
     tokens: Tensor
     token_valid: Tensor
+    labels: Tensor | None = None
 
 
-def log_item(context: SceneContext, tokenizer: MotionTokenizer) -> Item:
+def log_item(
+    context: SceneContext,
+    tokenizer: MotionTokenizer,
+    *,
+    noise: float = 0.0,
+    generator: torch.Generator | None = None,
+) -> Item:
     """The log of a scene as one rollout (M = 1): what pre-training learns from (eq. 1).
+
+    Noise is that of :meth:`~dpa.tokens.MotionTokenizer.encode_tracks`.
 
     Examples:
         >>> from dpa.policy import make_context
@@ -40,8 +50,11 @@ def log_item(context: SceneContext, tokenizer: MotionTokenizer) -> Item:
         >>> log_item(make_context(straight_road(2)), VerletTokenizer()).tokens.shape
         torch.Size([1, 2, 16])
     """
-    tracks = tokenizer.encode_tracks(context.logged, context.logged_valid, context.recent, context.kind)
-    return Item(context, tracks.tokens[None], tracks.valid & context.controlled[:, None])
+    tracks = tokenizer.encode_tracks(
+        context.logged, context.logged_valid, context.recent, context.kind, noise=noise, generator=generator
+    )
+    valid = tracks.valid & context.controlled[:, None]
+    return Item(context, tracks.tokens[None], valid, tracks.labels[None])
 
 
 def crop_agents(item: Item, limit: int, generator: torch.Generator) -> Item:
@@ -52,11 +65,12 @@ def crop_agents(item: Item, limit: int, generator: torch.Generator) -> Item:
     xy = item.context.recent[:, -1, :2]
     centre = xy[torch.randint(count, (), generator=generator)]
     near = (xy - centre).norm(dim=-1).argsort(stable=True)[:limit].sort().values
-    return Item(keep_agents(item.context, near), item.tokens[:, near], item.token_valid[near])
+    labels = None if item.labels is None else item.labels[:, near]
+    return Item(keep_agents(item.context, near), item.tokens[:, near], item.token_valid[near], labels)
 
 
 def collate_items(items: Sequence[Item]) -> TensorDict:
-    """A batch for a loss: ``context``, ``tokens`` ``[S, M, A, T]`` and ``token_valid`` ``[S, 1, A, T]``.
+    """A batch for a loss: ``context``, ``tokens`` and ``labels`` ``[S, M, A, T]`` and ``token_valid`` ``[S, 1, A, T]``.
 
     Args:
         items: S items of equal M and T.
@@ -70,6 +84,7 @@ def collate_items(items: Sequence[Item]) -> TensorDict:
         {
             "context": collate_contexts([item.context for item in items]),
             keys.TOKENS: torch.stack([pad(item.tokens) for item in items]),
+            keys.LABELS: torch.stack([pad(item.tokens if item.labels is None else item.labels) for item in items]),
             keys.TOKEN_VALID: torch.stack([pad(item.token_valid) for item in items])[:, None],
         },
         batch_size=[len(items)],

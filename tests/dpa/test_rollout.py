@@ -39,7 +39,7 @@ def scenes() -> list[Scene]:
     return [straight_road(size, seed=index) for index, size in enumerate(SIZES)]
 
 
-def first_steps(batches: list[TensorDictBase], num_rollouts: int) -> dict[int, TensorDict]:
+def tokens_of(batches: list[TensorDictBase], num_rollouts: int) -> dict[int, TensorDict]:
     """Tokens of every scene: index -> ``[K, T, A]`` without padding."""
     found = {}
     for batch in batches:
@@ -86,12 +86,12 @@ def test_every_scene_is_rolled_out_once_in_groups_of_similar_size(scenes: list[S
 @pytest.mark.parametrize("max_rows", [4, 8, 1000])
 def test_indices_are_those_of_the_whole_source(model: MotionLM, scenes: list[Scene], max_rows: int) -> None:
     batches = collect_groups(scenes, model, [0, 2, 3], num_rollouts=2, max_rows=max_rows)
-    assert sorted(first_steps(list(batches), 2)) == [0, 2, 3]
+    assert sorted(tokens_of(list(batches), 2)) == [0, 2, 3]
 
 
 def test_rollouts_depend_on_the_seed_and_on_nothing_else(model: MotionLM, scenes: list[Scene]) -> None:
     def collect(seed: int) -> dict[int, TensorDict]:
-        return first_steps(list(collect_groups(scenes, model, range(4), num_rollouts=2, seed=seed, max_rows=8)), 2)
+        return tokens_of(list(collect_groups(scenes, model, range(4), num_rollouts=2, seed=seed, max_rows=8)), 2)
 
     first = collect(0)
     torch.manual_seed(99)
@@ -106,8 +106,8 @@ def test_what_is_left_of_an_interrupted_collection_comes_out_as_it_would_have(
 ) -> None:
     """Even where the interruption cut a group in two."""
     options = {"num_rollouts": 2, "max_rows": 8}
-    whole = first_steps(list(collect_groups(scenes, model, range(4), **options)), 2)
-    rest = first_steps(list(collect_groups(scenes, model, range(4), done=done, **options)), 2)
+    whole = tokens_of(list(collect_groups(scenes, model, range(4), **options)), 2)
+    rest = tokens_of(list(collect_groups(scenes, model, range(4), done=done, **options)), 2)
     assert set(rest) >= set(range(4)) - set(done)
     assert all(torch.equal(rest[scene], whole[scene]) for scene in rest)
 

@@ -22,7 +22,7 @@ class Table(nn.Module):
         self.logits = nn.Parameter(logits)
 
     def forward(self, context: SceneContext, tokens: Tensor, token_valid: Tensor) -> Tensor:
-        return self.logits.expand(*tokens.shape[:2], *self.logits.shape)
+        return (1 * self.logits).expand(*tokens.shape[:2], *self.logits.shape)
 
 
 def table(agents: int = 2, horizon: int = 3, seed: int = 0) -> Table:

@@ -1,0 +1,231 @@
+"""The command line of every recipe: help, and one clear line for what a user can mend."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from dpa.ranking import PreferenceDistance
+from recipes.cli import build, finished, write_json
+
+RECIPES = ("pretrain", "collect", "align", "evaluate", "tokens", "compare")
+pytestmark = pytest.mark.usefixtures("stores")
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory, run: Callable, options: Callable) -> Path:
+    """A folder with a trained ``reference``, its ``preferences``, and a policy of ``other`` weights."""
+    folder = tmp_path_factory.mktemp("runs")
+    for name, seed in (("reference", 0), ("other", 1)):
+        command = options("pretrain", f"output={folder / name}", f"seed={seed}", "pretraining.steps=2")
+        assert run("pretrain", *command).status == 0
+    command = options("collect", f"policy={folder / 'reference/policy.pt'}", f"output={folder / 'preferences'}")
+    assert run("collect", *command).status == 0
+    return folder
+
+
+def assert_refused(outcome: tuple, *words: str) -> None:
+    """Exit status 2 and one line that says what is wrong; no traceback."""
+    status, _, err = outcome
+    errors = [line for line in err.splitlines() if line.startswith("error:")]
+    assert status == 2, err
+    assert len(errors) == 1, err
+    assert "Traceback" not in err
+    for word in words:
+        assert word in errors[0]
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_help_says_what_the_recipe_does_and_takes(run: Callable, recipe: str) -> None:
+    outcome = run(recipe, "--help")
+    assert outcome.status == 0
+    assert outcome.out.startswith(f"python -m recipes.{recipe}")
+    assert "scenes:" in outcome.out and "seed" in outcome.out
+
+
+def test_the_demo_has_a_configuration(run: Callable) -> None:
+    outcome = run("compare", "--config-name", "demo", "--cfg", "job")
+    assert outcome.status == 0
+    assert OmegaConf.create(outcome.out).model.size == "nano"
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_an_unknown_key_is_told_by_name(run: Callable, recipe: str) -> None:
+    outcome = run(recipe, "scenes.trian=somewhere")
+    assert outcome.status == 1
+    assert "Key 'trian' is not in struct" in outcome.err and "Traceback" not in outcome.err
+
+
+@pytest.mark.parametrize("recipe", ["collect", "align", "evaluate"])
+def test_an_option_that_is_missing_is_told_by_name(run: Callable, options: Callable, recipe: str) -> None:
+    assert_refused(run(recipe, *options(recipe)), "policy")
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_scenes_that_do_not_exist_are_told_by_path(
+    run: Callable, options: Callable, recipe: str, tmp_path: Path
+) -> None:
+    more = [] if recipe in ("pretrain", "tokens", "compare") else ["policy=none.pt"]
+    command = options(recipe, *more, "scenes.train=nowhere", f"{output_of(recipe)}={tmp_path / 'out'}")
+    assert_refused(run(recipe, *command), "nowhere")
+
+
+def output_of(recipe: str) -> str:
+    return "json" if recipe in ("evaluate", "tokens") else "output"
+
+
+@pytest.mark.parametrize("recipe", ["collect", "align", "evaluate"])
+def test_a_policy_that_does_not_exist_is_told_by_path(
+    run: Callable, options: Callable, recipe: str, tmp_path: Path, runs: Path
+) -> None:
+    more = [f"preferences={runs / 'preferences'}"] if recipe == "align" else []
+    command = options(recipe, "policy=none.pt", *more, f"{output_of(recipe)}={tmp_path / 'out'}")
+    assert_refused(run(recipe, *command), "none.pt does not exist")
+
+
+def test_a_file_that_is_no_policy_is_told_by_path(run: Callable, options: Callable, tmp_path: Path) -> None:
+    (tmp_path / "policy.pt").write_text("no policy")
+    command = options("evaluate", f"policy={tmp_path / 'policy.pt'}", f"json={tmp_path / 'out.json'}")
+    assert_refused(run("evaluate", *command), str(tmp_path / "policy.pt"), "no whole checkpoint")
+
+
+def test_a_split_that_does_not_exist_is_told(run: Callable, options: Callable, tmp_path: Path) -> None:
+    command = options("tokens", "split=test", f"json={tmp_path / 'out.json'}")
+    assert_refused(run("tokens", *command), "split must be one of train, tune, eval, got 'test'")
+
+
+def test_a_run_does_not_go_on_with_a_policy_of_another_size(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(runs / "reference", tmp_path / "reference")
+    command = options("pretrain", f"output={tmp_path / 'reference'}", "pretraining.steps=2", "model=small")
+    assert_refused(run("pretrain", *command), "'width': 48", "'width': 64")
+
+
+def test_preferences_of_other_scenes_are_refused(
+    run: Callable, options: Callable, runs: Path, stores: Path, tmp_path: Path
+) -> None:
+    command = options(
+        "align",
+        f"policy={runs / 'reference/policy.pt'}",
+        f"preferences={runs / 'preferences'}",
+        f"output={tmp_path / 'out'}",
+        f"scenes.train={stores / 'other'}",
+    )
+    assert_refused(run("align", *command), "preferences ranks rollouts of other scenes; collect again")
+
+
+def test_preferences_of_another_policy_are_refused(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path
+) -> None:
+    command = options(
+        "align",
+        f"policy={runs / 'other/policy.pt'}",
+        f"preferences={runs / 'preferences'}",
+        f"output={tmp_path / 'out'}",
+    )
+    assert_refused(run("align", *command), "ranks rollouts of another policy", "other/policy.pt")
+
+
+def test_rollouts_of_two_policies_do_not_go_into_one_store(run: Callable, options: Callable, runs: Path) -> None:
+    command = options("collect", f"policy={runs / 'other/policy.pt'}", f"output={runs / 'preferences'}")
+    assert_refused(run("collect", *command), "groups of another origin", "policy")
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ("method.loss.kind=dpo", ("method.loss.kind must be one of", "dpo")),
+        ("method.data.kind=worst", ("method.data.kind must be one of", "worst")),
+        ("method.data.rank_by=taste", ("method.data.rank_by must be distance or ade", "taste")),
+        ("+method.loss.beta=1", ("method.loss (contrastive) has no option 'beta'", "alpha")),
+        ("method.loss.alpha=-1", ("alpha must be positive, got -1",)),
+        ("alignment.warmup=9", ("warmup_steps must lie in [0, total_steps), got 9 of 4",)),
+        ("method.data.num=3", ("3",)),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path, option: str, words: tuple[str, ...]
+) -> None:
+    command = options(
+        "align",
+        f"policy={runs / 'reference/policy.pt'}",
+        f"preferences={runs / 'preferences'}",
+        f"output={tmp_path / 'out'}",
+        "method.data.num=2",
+        option,
+    )
+    assert_refused(run("align", *command), *words)
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ("scenes.tune=8", ("scenes.tune must lie between 1 and the 7 training scenes, got 8",)),
+        ("scenes.source=wmod", ("wmod",)),
+        ("model.size=huge", ("model.size must be one of", "huge")),
+        ("model.tokenizer.name=patches", ("model.tokenizer.name must be one of", "patches")),
+        ("+model.context.depth=3", ("model.context has no option 'depth'",)),
+        ("model.context.horizon=17", ("17",)),
+        ("logger.backend=paper", ("logger.backend must be csv, wandb or tensorboard, got 'paper'",)),
+        ("seed=-1", ("seed must lie in", "-1")),
+    ],
+)
+def test_options_of_training_that_make_no_sense_are_refused(
+    run: Callable, options: Callable, tmp_path: Path, option: str, words: tuple[str, ...]
+) -> None:
+    assert_refused(run("pretrain", *options("pretrain", f"output={tmp_path / 'out'}", option)), *words)
+
+
+def test_scenes_that_are_trained_and_evaluated_on_are_refused(
+    run: Callable, options: Callable, stores: Path, tmp_path: Path
+) -> None:
+    command = options("pretrain", f"output={tmp_path}", f"scenes.eval={stores / 'train'}")
+    assert_refused(run("pretrain", *command), "scenes.train and scenes.eval share 8 scenes")
+
+
+# --- what they are made of ------------------------------------------------------------------------------------------
+def test_a_section_that_lacks_an_option_is_told() -> None:
+    def target(alpha: float) -> float:
+        return alpha
+
+    with pytest.raises(ValueError, match="method.loss missing a required argument: 'alpha'"):
+        build(target, OmegaConf.create({}), "method.loss")
+
+
+def test_a_section_becomes_the_arguments_of_a_class() -> None:
+    distance = build(PreferenceDistance, OmegaConf.create({"stride": 5, "aggregate": "mean"}), "collection.ranking")
+    assert distance.describe()["stride"] == 5
+
+
+def test_a_result_of_the_same_options_is_read_back_and_others_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "result.json"
+    assert finished(path, {"seed": 0}) is None
+    write_json(path, {"options": {"seed": 0, "grid": [1, 2]}, "value": 3.0})
+    assert finished(path, {"seed": 0, "grid": (1, 2)})["value"] == 3.0
+    with pytest.raises(ValueError, match=r"other options \(seed\); name another output folder"):
+        finished(path, {"seed": 1, "grid": (1, 2)})
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}"])
+def test_a_file_that_is_no_result_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "result.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=r"result.json is no result of this recipe .* remove it"):
+        finished(path, {"seed": 0})
+
+
+def test_a_number_that_json_does_not_have_is_not_written(tmp_path: Path) -> None:
+    write_json(tmp_path / "result.json", {"value": 1.0})
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(tmp_path / "result.json", {"value": float("nan")})
+    assert json.loads((tmp_path / "result.json").read_text()) == {"value": 1.0}
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])
