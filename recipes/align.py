@@ -81,6 +81,7 @@ def align(
         total_steps=options.steps,
         checkpoint_interval=options.checkpoint_interval,
         backend=cfg.logger.backend,
+        mode=cfg.logger.mode,
         description=method.name,
     )
     with run:

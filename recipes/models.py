@@ -31,6 +31,11 @@ def policy_config(cfg: DictConfig) -> dict[str, Any]:
     if cfg.tokenizer.name not in TOKENIZERS:
         raise ValueError(f"model.tokenizer.name must be one of {sorted(TOKENIZERS)}, got {cfg.tokenizer.name!r}.")
     context = context_options(cfg)
+    if cfg.tokenizer.steps != context.decision_steps:
+        raise ValueError(
+            f"model.tokenizer.steps and model.context.decision_steps must be equal, got {cfg.tokenizer.steps} and "
+            f"{context.decision_steps}."
+        )
     size = SIZES[cfg.size].as_dict() | {"horizon": context.horizon, "dropout": cfg.dropout}
     return {"model": size, "tokenizer": plain(cfg.tokenizer), "context": asdict(context)}
 

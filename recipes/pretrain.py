@@ -62,6 +62,7 @@ def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path) -> Path:
         total_steps=options.steps,
         checkpoint_interval=options.checkpoint_interval,
         backend=cfg.logger.backend,
+        mode=cfg.logger.mode,
         description="pretrain",
     )
     run.state.setdefault("best_nll", float("inf"))

@@ -41,7 +41,7 @@ CURVES = (
     "train/kl",
     "train/entropy",
 )
-"""Scalars that are drawn (METHOD figures 4 and 6, PRIOR point 2)."""
+"""Scalars that are drawn (METHOD figures 4 and 6)."""
 PLAYED_ROLLOUTS = 4
 PACKAGES = ("torch", "torchrl", "tensordict", "pot", "numpy", "dpa-omf")
 
@@ -140,6 +140,7 @@ def write_report(cfg: DictConfig, splits: Splits, comparison: dict[str, Any]) ->
         comparison,
         [
             Picture(folder / "comparison.png", "Differences to the reference. Paired per scene, with 95 % intervals."),
+            Picture(folder / "own_best.png", "Each method at its own best top-p. Chosen on the tuning scenes."),
             Picture(
                 folder / "curves.png", f"Alignment of seed {seed}. Likelihood of preferred and unpreferred rollouts."
             ),
@@ -162,7 +163,14 @@ def play(cfg: DictConfig, splits: Splits, seed: int) -> list[PlayerScene]:
         model, context, _ = open_policy(Path(cfg.output) / f"seed_{seed}" / method / "policy.pt", cfg.device)
         decoding = Decoding(cfg.decoding.common, cfg.evaluation.temperature)
         batches = collect_groups(
-            splits.eval, model, wanted, num_rollouts=PLAYED_ROLLOUTS, decoding=decoding, options=context, seed=seed
+            splits.eval,
+            model,
+            wanted,
+            num_rollouts=PLAYED_ROLLOUTS,
+            decoding=decoding,
+            options=context,
+            seed=seed,
+            device=cfg.device,
         )
         for batch in batches:
             poses = simulated_poses(batch, PLAYED_ROLLOUTS).cpu()

@@ -114,9 +114,10 @@ class MotionActor(TensorDictModuleBase):
         self._start(tensordict[keys.SCENE], step, recent.shape[:2])
         controlled = tensordict[keys.CONTROLLED]
         last = torch.where((step[:, None] > 0) & controlled, self._last, self.model.no_token)
-        mask = self._cache.start(step, tensordict[keys.VALID])
-        nodes = NodeInputs(recent, last, step[:, None].expand_as(last), tensordict[keys.KIND])
-        return self.model.decoder(nodes, self._memory, mask, self._cache)
+        valid = tensordict[keys.VALID]
+        masks = self._cache.start(step, valid)
+        nodes = NodeInputs(recent, last, step[:, None].expand_as(last), tensordict[keys.KIND], valid)
+        return self.model.decoder(nodes, self._memory, masks, self._cache)
 
     def _start(self, scene: Tensor, step: Tensor, shape: torch.Size) -> None:
         """Encode the scenes of which an episode starts."""

@@ -36,6 +36,18 @@ class KeyValues(NamedTuple):
     values: Tensor
 
 
+class NodeMasks(NamedTuple):
+    """What nodes see of each other.
+
+    Attributes:
+        own: broadcastable to ``[B * A, 1, decisions, remembered decisions]`` bool, along the own past.
+        everybody: broadcastable to ``[B, 1, m, n]`` bool.
+    """
+
+    own: Tensor
+    everybody: Tensor
+
+
 class RelativeAttention(nn.Module):
     """Multi-head attention between tokens with poses, invariant to moving and turning the scene.
 
@@ -89,11 +101,22 @@ class RelativeAttention(nn.Module):
         Returns:
             ``[B, m, width]``.
         """
+        seen = self._attend(self._queries(x, pose), memory, mask)
+        return self._merge(seen, pose)
+
+    def _queries(self, x: Tensor, pose: Tensor) -> Tensor:
+        """``[B, H, m, D + 3]``."""
         (query,) = self._split(self.query(x), 1)
         pose = pose[:, None]
-        query = torch.cat((self._query(query, pose), self._gaze(x, pose)), -1)
-        seen = F.scaled_dot_product_attention(query, memory.keys, memory.values, attn_mask=mask, scale=1.0)
-        return self.out(self._back(seen[..., : self.dim], pose).transpose(1, 2).flatten(2))
+        return torch.cat((self._query(query, pose), self._gaze(x, pose)), -1)
+
+    @staticmethod
+    def _attend(query: Tensor, memory: KeyValues, mask: Tensor | None) -> Tensor:
+        return F.scaled_dot_product_attention(query, memory.keys, memory.values, attn_mask=mask, scale=1.0)
+
+    def _merge(self, seen: Tensor, pose: Tensor) -> Tensor:
+        """Heads ``[B, H, m, D + 3]`` to ``[B, m, width]``, in the frames of the queries."""
+        return self.out(self._back(seen[..., : self.dim], pose[:, None]).transpose(1, 2).flatten(2))
 
     def _split(self, x: Tensor, parts: int) -> tuple[Tensor, ...]:
         """``[B, n, parts * width]`` to ``parts`` times ``[B, H, n, D]``."""
@@ -129,6 +152,56 @@ class RelativeAttention(nn.Module):
         precision = self.precision[:, None, None] * METRES**2 * width.exp()
         centre = pose[..., :2] / METRES + rotate(offset, pose[..., 2])
         return torch.cat((precision * centre, precision), -1)
+
+
+class NodeAttention(RelativeAttention):
+    """Attention between the nodes of a scene: agents x decisions, decision by decision.
+
+    The first heads look along the agent's own past only, as a recurrent network would; the rest look at all agents.
+    Both share keys and values, so one cache serves them.
+
+    Args:
+        width: channels of a node.
+        heads: H; a third of them, at least one, look along the own past.
+
+    Examples:
+        >>> attention = NodeAttention(32, heads=2)
+        >>> x, pose = torch.randn(1, 6, 32), torch.randn(1, 6, 3)  # two agents, three decisions
+        >>> own = torch.ones(3, 3, dtype=torch.bool).tril()
+        >>> masks = NodeMasks(own, own.repeat_interleave(2, 0).repeat_interleave(2, 1))
+        >>> attention(x, pose, attention.remember(x, pose), masks, agents=2).shape
+        torch.Size([1, 6, 32])
+    """
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__(width, heads, gaze=(60.0, 8.0))  # the own past may lie far behind
+        self.own = max(1, heads // 3)
+
+    def forward(self, x: Tensor, pose: Tensor, memory: KeyValues, masks: NodeMasks, agents: int) -> Tensor:
+        """Attend from nodes to remembered ones.
+
+        Args:
+            x: ``[B, m, width]``, m a multiple of A.
+            pose: ``[B, m, 3]``.
+            memory: of n nodes, n a multiple of A.
+            masks: what a node sees.
+            agents: A.
+
+        Returns:
+            ``[B, m, width]``.
+        """
+        query = self._queries(x, pose)
+        rest = KeyValues(memory.keys[:, self.own :], memory.values[:, self.own :])
+        everybody = self._attend(query[:, self.own :], rest, masks.everybody)
+
+        def by_agent(heads: Tensor) -> Tensor:
+            """``[B, H, decisions * A, D]`` to ``[B * A, own, decisions, D]``."""
+            return heads[:, : self.own].unflatten(2, (-1, agents)).permute(0, 3, 1, 2, 4).flatten(0, 1)
+
+        past = KeyValues(by_agent(memory.keys), by_agent(memory.values))
+        own = self._attend(by_agent(query), past, masks.own)
+        own = own.unflatten(0, (len(x), agents)).permute(0, 2, 3, 1, 4).flatten(2, 3)
+        return self._merge(torch.cat((own, everybody), 1), pose)
 
 
 class FeedForward(nn.Sequential):

@@ -38,6 +38,9 @@ class ContextOptions:
         max_controlled: agents that the policy moves at most.
         decision_steps: F.
         horizon: T.
+
+    Raises:
+        ValueError: a number that is not positive, or an episode longer than a log.
     """
 
     max_pieces: int = 512
@@ -45,6 +48,16 @@ class ContextOptions:
     max_controlled: int = MAX_CONTROLLED
     decision_steps: int = 5
     horizon: int = 16
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            if getattr(self, field.name) <= 0:
+                raise ValueError(f"{field.name} must be positive, got {getattr(self, field.name)}.")
+        if HISTORY + self.decision_steps * self.horizon > LOG_STEPS:
+            raise ValueError(
+                f"horizon * decision_steps must be at most {LOG_STEPS - HISTORY} steps of 0.1 s, got "
+                f"{self.horizon} * {self.decision_steps}."
+            )
 
 
 class SceneContext(TensorClass["nocast"]):

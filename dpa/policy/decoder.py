@@ -12,11 +12,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from dpa.policy.attention import FeedForward, KeyValues, RelativeAttention
+from dpa.policy.attention import FeedForward, KeyValues, NodeAttention, NodeMasks, RelativeAttention
 from dpa.policy.encoder import LENGTH_SCALE, SceneTokens
+from dpa.policy.vicinity import Vicinity
 from envs.geometry.frames import rotate, wrap_angle
 from envs.scene import AgentKind
 
+NEAREST_PIECES, NEAREST_AGENTS = 16, 8
+"""Map pieces (with lights) and agents that a node reads one by one."""
 SPEED_SCALE = 5.0
 """Metres of a decision's displacement that count as one in a feature."""
 
@@ -27,12 +30,16 @@ class SceneMemory(NamedTuple):
     Attributes:
         layers: keys and values of the scene for each decoder layer.
         mask: ``[S, 1, 1, n]`` bool.
+        surroundings: the tokens themselves, without agents: ``[S, n - A, width]``.
+        surroundings_pose: ``[S, n - A, 3]``.
         agents: ``[S, A, width]`` scene embedding of each agent.
         extent: ``[S, A, 3]`` [m].
     """
 
     layers: tuple[KeyValues, ...]
     mask: Tensor
+    surroundings: Tensor
+    surroundings_pose: Tensor
     agents: Tensor
     extent: Tensor
 
@@ -45,12 +52,14 @@ class NodeInputs(NamedTuple):
         token: ``[B, Q]`` last token; V where there is none.
         step: ``[B, Q]`` index of the decision.
         kind: ``[B, Q]``.
+        valid: ``[B, Q]`` bool, others may look at the node.
     """
 
     recent: Tensor
     token: Tensor
     step: Tensor
     kind: Tensor
+    valid: Tensor
 
 
 class DecoderLayer(nn.Module):
@@ -58,7 +67,7 @@ class DecoderLayer(nn.Module):
 
     def __init__(self, width: int, heads: int, feed: int, dropout: float) -> None:
         super().__init__()
-        self.norm_nodes, self.nodes = nn.LayerNorm(width), RelativeAttention(width, heads)
+        self.norm_nodes, self.nodes = nn.LayerNorm(width), NodeAttention(width, heads)
         self.norm_scene, self.scene = nn.LayerNorm(width), RelativeAttention(width, heads)
         self.norm_feed, self.feed = nn.LayerNorm(width), FeedForward(width, feed)
         self.dropout = nn.Dropout(dropout)
@@ -68,13 +77,14 @@ class DecoderLayer(nn.Module):
         return self.nodes.remember(self.norm_nodes(x), pose)
 
     def forward(
-        self, x: Tensor, pose: Tensor, nodes: KeyValues, node_mask: Tensor, scene: KeyValues, scene_mask: Tensor
+        self, x: Tensor, pose: Tensor, nodes: KeyValues, masks: NodeMasks, memory: SceneMemory, index: int
     ) -> Tensor:
-        x = x + self.dropout(self.nodes(self.norm_nodes(x), pose, nodes, node_mask))
+        agents, scene = memory.agents.shape[1], memory.layers[index]
+        x = x + self.dropout(self.nodes(self.norm_nodes(x), pose, nodes, masks, agents))
         # The scene is shared by its rollouts: fold them into the queries instead of repeating keys and values.
         scenes = scene.keys.shape[0]
         folded = (t.unflatten(0, (scenes, -1)).flatten(1, 2) for t in (self.norm_scene(x), pose))
-        seen = self.scene(*folded, scene, scene_mask)
+        seen = self.scene(*folded, scene, memory.mask)
         x = x + self.dropout(seen.view_as(x))
         return x + self.dropout(self.feed(self.norm_feed(x)))
 
@@ -101,6 +111,8 @@ class MotionDecoder(nn.Module):
         self.time = nn.Embedding(horizon, width)
         self.kind = nn.Embedding(len(AgentKind), width)
         self.identity = nn.Linear(width, width)
+        self.map_vicinity = Vicinity(width, NEAREST_PIECES)
+        self.agent_vicinity = Vicinity(width, NEAREST_AGENTS)
         self.layers = nn.ModuleList(DecoderLayer(width, heads, feed, dropout) for _ in range(layers))
         self.norm = nn.LayerNorm(width)
         self.head = nn.Linear(width, vocab_size)
@@ -108,13 +120,21 @@ class MotionDecoder(nn.Module):
     def read_scene(self, tokens: SceneTokens, extent: Tensor) -> SceneMemory:
         """Keys and values of an encoded scene, for :meth:`forward`."""
         layers = tuple(layer.scene.remember(tokens.x, tokens.pose) for layer in self.layers)
-        return SceneMemory(layers, tokens.valid[:, None, None, :], tokens.agents, extent)
+        things = tokens.x.shape[1] - tokens.num_agents
+        return SceneMemory(
+            layers,
+            tokens.valid[:, None, None, :],
+            tokens.x[:, :things],
+            tokens.pose[:, :things],
+            tokens.agents,
+            extent,
+        )
 
     def forward(
         self,
         nodes: NodeInputs,
         memory: SceneMemory,
-        mask: Tensor,
+        masks: NodeMasks,
         cache: NodeCache | None = None,
     ) -> Tensor:
         """Logits of B rollouts' nodes, B a multiple of the memory's S.
@@ -122,19 +142,31 @@ class MotionDecoder(nn.Module):
         Args:
             nodes: Q nodes, a multiple of A, decision by decision.
             memory: of the S scenes.
-            mask: ``[B, 1, Q, n]`` bool, which nodes a node sees: the nodes given, or those in the cache.
+            masks: which nodes a node sees: of the nodes given, or of those in the cache.
             cache: nodes of earlier decisions; the given ones (Q = A) are added to it.
 
         Returns:
             ``[B, Q, V]``.
         """
         pose = nodes.recent[:, :, -1]
-        x = self._embed(nodes, memory)
+        x = self._look_around(self._embed(nodes, memory), nodes, memory)
         for index, layer in enumerate(self.layers):
             own = layer.remember(x, pose)
             seen = own if cache is None else cache.add(index, own)
-            x = layer(x, pose, seen, mask, memory.layers[index], memory.mask)
+            x = layer(x, pose, seen, masks, memory, index)
         return self.head(self.norm(x))
+
+    def _look_around(self, x: Tensor, nodes: NodeInputs, memory: SceneMemory) -> Tensor:
+        """Add what lies next to each node: map pieces and lights, and the other agents at the same decision."""
+        pose, agents = nodes.recent[:, :, -1], memory.agents.shape[1]
+        folded = pose.unflatten(0, (len(memory.agents), -1)).flatten(1, 2)
+        mask = memory.mask[:, 0, :, : memory.surroundings.shape[1]]
+        x = x + self.map_vicinity(folded, memory.surroundings, memory.surroundings_pose, mask).view_as(x)
+        # Nodes of one decision side by side: [B * decisions, A].
+        together, at = (value.unflatten(1, (-1, agents)).flatten(0, 1) for value in (x, pose))
+        others = ~torch.eye(agents, dtype=torch.bool, device=x.device)
+        mask = nodes.valid.unflatten(1, (-1, agents)).flatten(0, 1)[:, None, :] & others
+        return x + self.agent_vicinity(at, together, at, mask).view_as(x)
 
     def _embed(self, nodes: NodeInputs, memory: SceneMemory) -> Tensor:
         scenes, agents = memory.agents.shape[:2]
@@ -172,21 +204,19 @@ class NodeCache:
         batch, _, horizon, agents = shape
         self.valid = torch.zeros(batch, horizon, agents, dtype=torch.bool, device=like.device)
 
-    def start(self, step: Tensor, valid: Tensor) -> Tensor:
-        """Begin a decision and get its mask.
+    def start(self, step: Tensor, valid: Tensor) -> NodeMasks:
+        """Begin a decision and get its masks: each row sees the nodes up to its own decision.
 
         Args:
             step: ``[B]`` int64 decision of each row.
             valid: ``[B, A]`` bool nodes.
-
-        Returns:
-            ``[B, 1, 1, n]`` bool: the nodes that each row sees, up to its own decision.
         """
         self._rows, self._step = torch.arange(len(step), device=step.device), step
         self._last = int(step.max()) + 1
         self.valid[self._rows, step] = valid
         earlier = torch.arange(self._last, device=step.device) <= step[:, None]
-        return (self.valid[:, : self._last] & earlier[..., None]).flatten(1)[:, None, None, :]
+        everybody = (self.valid[:, : self._last] & earlier[..., None]).flatten(1)[:, None, None, :]
+        return NodeMasks(earlier.repeat_interleave(valid.shape[1], 0)[:, None, None, :], everybody)
 
     def add(self, layer: int, nodes: KeyValues) -> KeyValues:
         """Write this decision's nodes and give all up to the last decision."""

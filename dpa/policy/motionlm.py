@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 import torch
 from torch import Tensor, nn
 
+from dpa.policy.attention import NodeMasks
 from dpa.policy.context import SceneContext
 from dpa.policy.decoder import MotionDecoder, NodeInputs, SceneMemory
 from dpa.policy.encoder import SceneEncoder
@@ -43,7 +44,7 @@ class MotionLMConfig:
 SIZES: dict[str, MotionLMConfig] = {
     "nano": MotionLMConfig(width=48, heads=3, feed=192, encoder_layers=1, decoder_layers=2),
     "small": MotionLMConfig(width=64, heads=4, feed=256, encoder_layers=2, decoder_layers=2),
-    "paper": MotionLMConfig(width=128, heads=4, feed=480, encoder_layers=2, decoder_layers=2),
+    "paper": MotionLMConfig(width=128, heads=4, feed=384, encoder_layers=2, decoder_layers=2),
 }
 """Named sizes; ``paper`` has 1M trainable parameters within 5 %."""
 
@@ -116,11 +117,13 @@ class MotionLM(nn.Module):
             token=last.transpose(1, 2).flatten(1),
             step=torch.arange(horizon, device=tokens.device).repeat_interleave(agents).expand(len(flat), -1),
             kind=kind.repeat(1, horizon),
+            valid=valid.transpose(1, 2).flatten(1),
         )
         order = nodes.step[0]
         staircase = order[:, None] >= order
-        mask = (staircase & valid.transpose(1, 2).flatten(1)[:, None, :])[:, None]
-        logits = self.decoder(nodes, self.encode(context), mask)
+        own = torch.ones(horizon, horizon, dtype=torch.bool, device=tokens.device).tril()
+        masks = NodeMasks(own, (staircase & nodes.valid[:, None, :])[:, None])
+        logits = self.decoder(nodes, self.encode(context), masks)
         return logits.view(scenes, rollouts, horizon, agents, -1).transpose(2, 3)
 
     @torch.no_grad()

@@ -32,7 +32,8 @@ class MotionTokenizer(nn.Module):
     """Maps one token to the F next poses of an agent, and back.
 
     A tokenizer has no memory: what it needs of the past it reads from ``recent``, the poses of the last decision. A
-    subclass gives ``vocab_size``, ``steps`` (F), :meth:`encode` and :meth:`decode`; tables and bin sizes are buffers.
+    subclass gives ``vocab_size``, ``steps`` (F), :meth:`encode`, :meth:`decode` and :meth:`neighbour`; tables and bin sizes
+    are buffers.
 
     Attributes:
         vocab_size: V.
@@ -60,7 +61,7 @@ class MotionTokenizer(nn.Module):
         """The motion of a token: ``[*, F, 3]`` poses in the agent's own current frame (arguments as in encode)."""
 
     @abstractmethod
-    def neighbour(self, token: Tensor, generator: torch.Generator) -> Tensor:
+    def neighbour(self, token: Tensor, kind: Tensor, generator: torch.Generator | None) -> Tensor:
         """A random token of nearly the same motion as each token ``[*]``, for noisy tokenization."""
 
     def encode_tracks(
@@ -96,16 +97,16 @@ class MotionTokenizer(nn.Module):
         for step in range(decisions.shape[-3]):
             target = to_local(decisions[..., step, :, :], recent[..., -1:, :])
             labels.append(self.encode(target, recent, kind))
-            tokens.append(self._noisy(labels[-1], noise, generator))
+            tokens.append(self._noisy(labels[-1], kind, noise, generator))
             recent = self.advance(tokens[-1], recent, kind)
             tracks.append(recent[..., 1:, :])
         return TokenizedTracks(torch.stack(tokens, -1), token_valid, torch.cat(tracks, -2), torch.stack(labels, -1))
 
-    def _noisy(self, token: Tensor, noise: float, generator: torch.Generator | None) -> Tensor:
+    def _noisy(self, token: Tensor, kind: Tensor, noise: float, generator: torch.Generator | None) -> Tensor:
         if noise == 0:
             return token
         replaced = torch.rand(token.shape, generator=generator, device=token.device) < noise
-        return torch.where(replaced, self.neighbour(token, generator), token)
+        return torch.where(replaced, self.neighbour(token, kind, generator), token)
 
     def decode_tracks(self, tokens: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
         """Poses of a row of tokens.

@@ -100,7 +100,7 @@ class VerletTokenizer(MotionTokenizer):
         xy = self._interpolate(last, end)
         return torch.cat((xy, self._headings(xy, kind)[..., None]), -1)
 
-    def neighbour(self, token: Tensor, generator: torch.Generator) -> Tensor:
+    def neighbour(self, token: Tensor, kind: Tensor, generator: torch.Generator | None) -> Tensor:
         change = torch.stack((token // CHANGES, token % CHANGES), -1)
         step = torch.randint(-1, 2, change.shape, generator=generator, device=token.device)
         change = (change + step).clamp(0, CHANGES - 1)

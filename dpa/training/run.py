@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from dpa.training.checkpoint import Checkpointer, Stateful, capture, restore
 from dpa.training.loggers import Backend, make_logger
@@ -24,6 +24,7 @@ class Run:
         total_steps: updates of the whole run.
         checkpoint_interval: updates between two checkpoints: what a kill can cost at most.
         backend: where curves go beside CSV.
+        mode: of Weights & Biases.
         description: of the progress bar.
 
     Examples:
@@ -48,6 +49,7 @@ class Run:
         total_steps: int,
         checkpoint_interval: int,
         backend: Backend = "csv",
+        mode: Literal["online", "offline"] = "offline",
         description: str = "train",
     ) -> None:
         if checkpoint_interval < 1:
@@ -63,7 +65,9 @@ class Run:
             restore(saved, parts)
             self.state = dict(saved["progress"])
         self.first_step = 0 if saved is None else saved["step"]
-        self._logger = make_logger(backend, self.folder, config, resume_step=saved and saved["step"])
+        self._logger = make_logger(
+            backend, self.folder, config, resume_step=saved and saved["step"], mode=mode
+        )
         self._step = self.first_step
 
     def steps(self) -> Iterator[int]:

@@ -87,7 +87,9 @@ def sides(batch: TensorDict) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("reduction", REDUCTIONS)
-def test_with_a_reference_every_pair_starts_with_the_same_weight(network: tuple, batch: TensorDict, reduction: str) -> None:
+def test_with_a_reference_every_pair_starts_with_the_same_weight(
+    network: tuple, batch: TensorDict, reduction: str
+) -> None:
     out = ContrastivePreferenceLoss(network[0], score_reduction=reduction)(batch)
     assert out["loss_preference"].item() == pytest.approx(math.log(2), abs=1e-6)
     assert out["weight_mean"].item() == pytest.approx(0.5, abs=1e-6)
@@ -263,7 +265,9 @@ def test_it_trains_a_motion_model() -> None:
         ({"cloning": -0.1}, "cloning must not be negative, got -0.1"),
     ],
 )
-def test_options_outside_their_range_are_refused(network: tuple[TensorDictModule, Tensor], options: dict, message: str) -> None:
+def test_options_outside_their_range_are_refused(
+    network: tuple[TensorDictModule, Tensor], options: dict, message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         ContrastivePreferenceLoss(network[0], **options)
 

@@ -60,6 +60,17 @@ def test_tokens_that_are_not_valid_do_not_matter(network: tuple, logs: TensorDic
     assert (loss.actor_network_params["module", "logits"].grad[-1, 1:] == 0).all()
 
 
+def test_labels_may_be_other_tokens_than_those_that_are_read(network: tuple, logs: TensorDict) -> None:
+    actor, logits = network
+    labels = (logs["tokens"] + 2) % 5
+    loss = NextTokenLoss(actor)
+    loss.set_keys(labels="labels")
+    out = loss(logs.set("labels", labels))
+    assert out["loss_next_token"].item() == pytest.approx(by_hand(logits, labels, 0.0), abs=1e-5)
+    expected = NextTokenLoss(actor)(logs.clone().set("tokens", labels))
+    assert torch.equal(out["accuracy"], expected["accuracy"])
+
+
 def test_no_valid_token_is_no_loss(network: tuple, logs: TensorDict) -> None:
     logs["token_valid"] = torch.zeros_like(logs["token_valid"])
     assert NextTokenLoss(network[0])(logs)["loss_next_token"].item() == 0
@@ -81,11 +92,12 @@ def test_keys_can_be_set_to_nested_ones(network: tuple, logs: TensorDict) -> Non
     loss = NextTokenLoss(network[0])
     expected = loss(logs)
     renamed = {name: ("data", name) for name in ("context", "tokens", "token_valid")}
-    loss.set_keys(**renamed)
+    loss.set_keys(**renamed, labels=renamed["tokens"])
+    assert loss.in_keys == list(renamed.values())
     nested = TensorDict({key: logs[name] for name, key in renamed.items()}, batch_size=logs.batch_size)
     assert (loss(nested) == expected).all()
-    with pytest.raises(ValueError, match="labels"):
-        loss.set_keys(labels="tokens")
+    with pytest.raises(ValueError, match="targets"):
+        loss.set_keys(targets="tokens")
 
 
 def test_plain_tensors_can_be_given_instead_of_a_tensordict(network: tuple, logs: TensorDict) -> None:

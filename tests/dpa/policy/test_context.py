@@ -50,13 +50,23 @@ def test_pieces_point_along_their_lane() -> None:
     torch.testing.assert_close(heading[y == 2.5].cos(), -torch.ones(int((y == 2.5).sum())))
 
 
-def test_the_pieces_nearest_to_any_agent_are_kept() -> None:
-    every = make_context(straight_road(2), ContextOptions(max_pieces=10_000))
-    few = make_context(straight_road(2), ContextOptions(max_pieces=20))
-    assert len(few.map_kind) == 20
-    agents = every.recent[:, -1, :2]
-    reach = torch.cdist(few.map_pose[:, :2], agents).amin(1).max()
-    assert (torch.cdist(every.map_pose[:, :2], agents).amin(1) < reach - 1e-3).sum() <= 20
+def test_the_pieces_along_which_agents_may_move_are_kept() -> None:
+    """Two cars at x = 0 and -15 drive at 10 m/s: what they may reach in 8 s lies between -15 and 80."""
+    few = make_context(straight_road(2, speed=10.0), ContextOptions(max_pieces=40))
+    assert len(few.map_kind) == 40
+    assert ((few.map_pose[:, 0] > -40) & (few.map_pose[:, 0] < 105)).all()
+    standing = make_context(straight_road(2, speed=0.0), ContextOptions(max_pieces=20))
+    assert (standing.map_pose[:, 0].abs() < 50).all()
+
+
+def test_where_agents_really_go_has_no_say_in_what_is_seen() -> None:
+    scene = straight_road(2).clone()
+    before = make_context(scene, ContextOptions(max_pieces=20))
+    scene.agents.position[:, CURRENT_STEP + 1 :] += 50.0
+    scene.agents.velocity[:, CURRENT_STEP + 1 :] *= -1.0
+    after = make_context(scene, ContextOptions(max_pieces=20))
+    for name in ("map_pose", "map_points", "map_kind", "history", "recent", "extent"):
+        assert torch.equal(getattr(after, name), getattr(before, name)), name
 
 
 def test_polylines_of_one_point_are_pieces_too() -> None:
@@ -118,6 +128,19 @@ def test_options_bound_the_controlled_agents_and_the_horizon() -> None:
     context = make_context(straight_road(3), ContextOptions(max_controlled=1, horizon=4))
     assert context.controlled.tolist() == [True, False, False]
     assert context.logged.shape == (3, 20, 3)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"max_pieces": 0}, "max_pieces must be positive, got 0"),
+        ({"piece_length": -1.0}, "piece_length must be positive, got -1.0"),
+        ({"horizon": 9, "decision_steps": 9}, r"at most 80 steps of 0.1 s, got 9 \* 9"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(options: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        ContextOptions(**options)
 
 
 def test_collated_contexts_are_padded_with_what_is_invalid(scene: Callable[..., Scene]) -> None:

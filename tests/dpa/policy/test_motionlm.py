@@ -56,9 +56,7 @@ def test_logits_follow_the_order_of_the_agents(model: MotionLM, scene: Callable[
 
 
 @pytest.mark.parametrize("decision", [0, 1, 7, 15])
-def test_a_token_changes_no_decision_up_to_its_own(
-    model: MotionLM, scene: Callable[..., Scene], decision: int
-) -> None:
+def test_a_token_changes_no_decision_up_to_its_own(model: MotionLM, scene: Callable[..., Scene], decision: int) -> None:
     context, tokens = make_context(scene(4)), draw(4)
     other = tokens.clone()
     other[:, :, 1, decision:] = draw(4, seed=1)[:, :, 1, decision:]

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dpa.tokens import VerletTokenizer
+from dpa.tokens import TokenizedTracks, VerletTokenizer
 from dpa.tokens.verlet import CHANGES, DEFAULT_BINS, DEFAULT_TURN, MAX_BIN
 from envs.geometry.frames import to_world, wrap_angle
 from envs.scene import AgentKind
@@ -85,7 +85,7 @@ def test_reconstruction_is_never_more_than_half_a_bin_away(tokenizer: VerletToke
 
 
 def test_errors_do_not_add_up() -> None:
-    """Encoded against the log instead of the reconstruction, an odd speed would drift by up to half a bin a decision."""
+    """Encoded against the log instead of the reconstruction, an odd speed would drift by half a bin a decision."""
     bin_size = DEFAULT_BINS["vehicle"][0]
     step = 0.4 * bin_size / 5
     track = torch.zeros(1, 80, 3)
@@ -198,7 +198,8 @@ def test_the_heading_turns_no_faster_than_the_class_allows(tokenizer: VerletToke
 
 def test_a_slow_turn_follows_the_motion() -> None:
     """Where the limit does not bind the heading is the direction of the motion."""
-    poses = decode(VerletTokenizer(turn={"vehicle": 9.0, "pedestrian": 9.0, "cyclist": 9.0}), [token(0, 1)], at_speed(5.0))
+    tokenizer = VerletTokenizer(turn={"vehicle": 9.0, "pedestrian": 9.0, "cyclist": 9.0})
+    poses = decode(tokenizer, [token(0, 1)], at_speed(5.0))
     moves = torch.diff(poses[:, :2], dim=0, prepend=torch.zeros(1, 2))
     torch.testing.assert_close(poses[:, 2], torch.atan2(moves[:, 1], moves[:, 0]))
 
@@ -222,6 +223,53 @@ def test_tokens_are_valid_up_to_the_first_hole(missing: list[int], expected: int
     result = VerletTokenizer().encode_tracks(poses, valid, agents.recent(5), agents.kind)
     assert result.valid.sum() == expected and result.valid[0, :expected].all()
     assert torch.isfinite(result.poses).all()
+
+
+# --- noise ----------------------------------------------------------------------------------------------------------
+def noisy_tracks(noise: float, seed: int = 0) -> tuple[TokenizedTracks, TokenizedTracks]:
+    """The same tracks with noise and without."""
+    agents = straight_road(6, seed=1).agents
+    given = (agents.poses[:, 11:], agents.valid[:, 11:], agents.recent(5), agents.kind)
+    generator = torch.Generator().manual_seed(seed)
+    tokenizer = VerletTokenizer()
+    return tokenizer.encode_tracks(*given, noise=noise, generator=generator), tokenizer.encode_tracks(*given)
+
+
+def test_without_noise_the_labels_are_the_tokens() -> None:
+    plain, same = noisy_tracks(0.0)
+    assert torch.equal(plain.labels, plain.tokens) and torch.equal(plain.tokens, same.tokens)
+
+
+def test_noise_replaces_tokens_by_neighbours_and_labels_lead_back_to_the_log() -> None:
+    noisy, plain = noisy_tracks(0.5)
+    replaced = noisy.tokens != noisy.labels
+    assert 0.2 < replaced.float().mean() < 0.7
+    for part in (lambda t: t // CHANGES, lambda t: t % CHANGES):
+        assert (part(noisy.tokens) - part(noisy.labels)).abs().max() <= 1
+    # The poses are those of the noisy tokens, and stay near the log all the same.
+    agents = straight_road(6, seed=1).agents
+    decoded = VerletTokenizer().decode_tracks(noisy.tokens, agents.recent(5), agents.kind)
+    torch.testing.assert_close(noisy.poses, decoded)
+    assert (noisy.poses - agents.poses[:, 11:])[..., :2].norm(dim=-1).max() < 1.5
+    assert torch.equal(noisy.valid, plain.valid)
+    # The label is what brings the agent back: the token that a fresh encoding from there gives.
+    first = replaced.nonzero()[0]
+    agent, step = first[0].item(), first[1].item()
+    assert torch.equal(noisy.tokens[agent, :step], plain.tokens[agent, :step])
+    assert noisy.labels[agent, step] == plain.tokens[agent, step]
+
+
+def test_noise_is_that_of_the_generator() -> None:
+    (one, _), (same, _), (other, _) = (noisy_tracks(0.5, seed) for seed in (1, 1, 2))
+    assert torch.equal(one.tokens, same.tokens) and not torch.equal(one.tokens, other.tokens)
+
+
+def test_neighbours_of_the_outermost_tokens_are_tokens() -> None:
+    corners = torch.tensor([0, 12, 156, 168]).repeat(100)
+    kind = torch.ones_like(corners)
+    neighbours = VerletTokenizer().neighbour(corners, kind, torch.Generator().manual_seed(0))
+    assert neighbours.min() >= 0 and neighbours.max() < CHANGES**2
+    assert set(neighbours.view(100, 4)[:, 0].tolist()) == {0, 1, 13, 14}
 
 
 # --- options --------------------------------------------------------------------------------------------------------

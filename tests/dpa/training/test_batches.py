@@ -88,6 +88,24 @@ def test_few_agents_are_left_alone() -> None:
     assert crop_agents(few, 3, make_generator(0)) is few
 
 
+def test_noisy_logs_have_labels_of_their_own_that_are_cropped_with_them() -> None:
+    context, tokenizer = make_context(straight_road(9)), VerletTokenizer()
+    noisy = log_item(context, tokenizer, noise=0.5, generator=make_generator(0, "noise"))
+    assert not torch.equal(noisy.tokens, noisy.labels)
+    cropped = crop_agents(noisy, 4, make_generator(0, "crop", 5))
+    plain = crop_agents(item(9), 4, make_generator(0, "crop", 5))
+    kept = [int((context.recent[:, -1, 0] == x).nonzero()[0]) for x in plain.context.recent[:, -1, 0]]
+    assert torch.equal(cropped.labels, noisy.labels[:, kept]) and torch.equal(cropped.tokens, noisy.tokens[:, kept])
+
+
+def test_labels_are_the_tokens_where_nothing_else_is_said() -> None:
+    one = item(2)
+    labelled = one._replace(tokens=one.tokens + 1)
+    batch = collate_items([labelled, Item(one.context, one.tokens, one.token_valid)])
+    assert torch.equal(batch["labels"][0], one.tokens) and torch.equal(batch["tokens"][0], one.tokens + 1)
+    assert torch.equal(batch["labels"][1], one.tokens)
+
+
 # --- batches --------------------------------------------------------------------------------------------------------
 def test_batches_are_padded_with_tokens_that_do_not_count() -> None:
     items = [item(1), item(3)]

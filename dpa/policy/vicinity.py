@@ -1,0 +1,80 @@
+"""What lies around an agent, read in its own frame through a small network.
+
+Attention with relative poses mixes what it sees linearly. To keep a lane or a gap, a policy needs sharp, non-linear
+functions of the few nearest things, so every node also pools over the map pieces and the agents next to it.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from envs.geometry.frames import to_local
+
+SCALE = 10.0
+"""Metres that count as one in a feature."""
+FEATURES = 5
+
+
+class Vicinity(nn.Module):
+    """Pools over the nearest tokens of a set, seen from each node.
+
+    Args:
+        width: channels of tokens and nodes.
+        nearest: tokens that a node sees at most.
+
+    Examples:
+        >>> vicinity = Vicinity(32, nearest=4)
+        >>> pose, token_pose = torch.zeros(1, 2, 3), torch.randn(1, 9, 3)
+        >>> vicinity(pose, torch.randn(1, 9, 32), token_pose, torch.ones(1, 1, 9, dtype=torch.bool)).shape
+        torch.Size([1, 2, 32])
+    """
+
+    def __init__(self, width: int, nearest: int) -> None:
+        super().__init__()
+        self.nearest = nearest
+        self.token = nn.Linear(width, width)
+        self.relative = nn.Linear(FEATURES, width)
+        self.inner = nn.Sequential(nn.GELU(), nn.Linear(width, width), nn.GELU())
+        self.out = nn.Linear(width, width)
+
+    def forward(self, pose: Tensor, tokens: Tensor, token_pose: Tensor, mask: Tensor) -> Tensor:
+        """Look around.
+
+        Args:
+            pose: ``[B, Q, 3]`` of the nodes.
+            tokens: ``[B, n, width]``.
+            token_pose: ``[B, n, 3]``.
+            mask: broadcastable to ``[B, Q, n]`` bool, true where a node may see a token.
+
+        Returns:
+            ``[B, Q, width]``; what no token contributes to is 0 before the last layer.
+        """
+        near, index = self._nearest(pose, token_pose, mask)
+        relative = to_local(_gather(token_pose, index), pose[..., None, :])
+        features = torch.cat(
+            (relative[..., :2] / SCALE, relative[..., 2:].cos(), relative[..., 2:].sin(), near[..., None] / SCALE), -1
+        )
+        seen = torch.isfinite(near)[..., None]
+        features = features.where(seen, features.new_zeros(()))
+        each = self.inner(_gather(self.token(tokens), index) + self.relative(features))
+        # GELU is bounded below, so that an unseen token, at that bound, never wins the maximum.
+        pooled = each.masked_fill(~seen, LOWEST).amax(-2)
+        return self.out(pooled.where(seen.any(-2), pooled.new_zeros(())))
+
+    @torch.no_grad()
+    def _nearest(self, pose: Tensor, token_pose: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Distances ``[B, Q, k]`` (infinite where there is nothing) and indices of the nearest tokens."""
+        offset = pose[:, :, None, :2] - token_pose[:, None, :, :2]
+        distance = offset.square().sum(-1).sqrt().masked_fill(~mask, torch.inf)
+        return distance.topk(min(self.nearest, distance.shape[-1]), largest=False)
+
+
+LOWEST = -1.0
+"""Below every value of GELU (its minimum is -0.17)."""
+
+
+def _gather(values: Tensor, index: Tensor) -> Tensor:
+    """``[B, n, d]`` at ``[B, Q, k]`` to ``[B, Q, k, d]``."""
+    rows = torch.arange(len(values), device=values.device)[:, None, None]
+    return values[rows, index]

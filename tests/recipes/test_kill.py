@@ -1,0 +1,92 @@
+"""kill -9 in the middle of a stage: the same command again ends as if nothing had happened."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from dpa.preferences import PreferenceStore
+from dpa.training.checkpoint import load_policy
+from dpa.training.loggers import read_curve
+from envs import keys
+
+pytestmark = pytest.mark.slow
+
+LONG = {
+    "pretrain": ["pretraining.steps=60", "pretraining.checkpoint_interval=5"],
+    "collect": ["collection.num_rollouts=24", "collection.max_rows=1", "collection.ranking.stride=1"],
+    "align": ["alignment.steps=60", "alignment.checkpoint_interval=5", "method.data.num=2"],
+    "evaluate": ["evaluation.num_rollouts=24", "evaluation.max_rows=1", "split=train"],
+}
+"""Options that give a kill something to interrupt; stages in the order in which they need each other."""
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory, run: Callable, options: Callable) -> Path:
+    """A folder with every stage, not interrupted: ``pretrain``, ``collect``, ``align``, ``evaluate.json``."""
+    folder = tmp_path_factory.mktemp("kill")
+    for stage in LONG:
+        outcome = run(stage, *command(stage, options, folder, folder))
+        assert outcome.status == 0, outcome.err
+    return folder
+
+
+def command(stage: str, options: Callable, runs: Path, output: Path) -> list[str]:
+    """Of one stage on the results of ``runs``, into ``output``."""
+    given = [] if stage == "pretrain" else [f"policy={runs / 'pretrain/policy.pt'}"]
+    given += [f"preferences={runs / 'collect'}"] if stage == "align" else []
+    into = f"json={output / 'evaluate.json'}" if stage == "evaluate" else f"output={output / stage}"
+    return options(stage, *LONG[stage], *given, into)
+
+
+def assert_same_policy(mine: Path, whole: Path) -> None:
+    for name, value in load_policy(whole / "policy.pt")[0].items():
+        assert torch.equal(load_policy(mine / "policy.pt")[0][name], value), name
+
+
+@pytest.mark.parametrize(
+    ("stage", "curve"), [("pretrain", "train/loss_next_token"), ("align", "train/loss_preference")]
+)
+@pytest.mark.parametrize("checkpoint", [5, 30])
+def test_killed_training(
+    run: Callable, options: Callable, kill_when: Callable, runs: Path, tmp_path: Path, stage: str, curve: str,
+    checkpoint: int,
+) -> None:  # fmt: skip
+    arguments = command(stage, options, runs, tmp_path)
+    kill_when((tmp_path / stage / f"checkpoints/step_{checkpoint:010d}.pt").exists, stage, *arguments)
+    assert not (tmp_path / stage / "policy.pt").exists()
+    assert run(stage, *arguments).status == 0
+    assert_same_policy(tmp_path / stage, runs / stage)
+    assert read_curve(tmp_path / stage, curve) == read_curve(runs / stage, curve)
+
+
+def test_killed_collection(run: Callable, options: Callable, kill_when: Callable, runs: Path, tmp_path: Path) -> None:
+    arguments = command("collect", options, runs, tmp_path)
+    kill_when(lambda: list((tmp_path / "collect").glob("chunk*")), "collect", *arguments)
+    assert len(PreferenceStore(tmp_path / "collect")) < 6
+    assert run("collect", *arguments).status == 0
+    mine, whole = (PreferenceStore(folder / "collect") for folder in (tmp_path, runs))
+    assert mine.scenes.tolist() == whole.scenes.tolist()
+    for row in range(6):
+        for key in (keys.TOKENS, keys.DISTANCE, keys.AGENT_DISTANCE, keys.ADE, keys.RANK):
+            assert torch.equal(mine[row][key], whole[row][key]), key
+
+
+def test_killed_evaluation(run: Callable, options: Callable, kill_when: Callable, runs: Path, tmp_path: Path) -> None:
+    arguments, partial = command("evaluate", options, runs, tmp_path), tmp_path / ".evaluate.json.scored"
+    kill_when(lambda: partial.exists() and partial.read_text().count("\n") > 2, "evaluate", *arguments)
+    scored = partial.read_text().count("\n") - 1
+    outcome = run("evaluate", *arguments)
+    assert outcome.status == 0
+    assert f"{scored}/6" in outcome.err, "the bar starts from what was scored"
+    mine, whole = (json.loads((folder / "evaluate.json").read_text()) for folder in (tmp_path, runs))
+    assert mine == whole
+    assert not partial.exists()
+
+
+if __name__ == "__main__":
+    pytest.main([__file__, "-m", "slow"])

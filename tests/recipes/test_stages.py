@@ -1,0 +1,294 @@
+"""The stages of the experiment on tiny scenes: what each writes, and that it goes on where it stopped."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+from dpa.preferences import PreferenceStore
+from dpa.training.checkpoint import load_policy
+from dpa.training.loggers import read_curve
+from envs import keys
+from envs.scene import CURRENT_STEP
+from envs.sources.synthetic import straight_road
+from envs.store import SceneStore
+from recipes import evaluate as evaluation
+from recipes.candidates import Group, pair_accuracy
+from recipes.evaluate import SCENE_FIGURES, standing_moved
+from recipes.models import open_policy
+from recipes.partial import PartialResult
+from recipes.pool import Job, run_jobs
+
+METHODS = ("dpa_omf", "dpa_adef", "sft_best_oa", "sft_best_ade", "adversarial_afd")
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory, run: Callable, options: Callable) -> Path:
+    """A folder with a trained ``reference`` and its ``preferences``."""
+    folder = tmp_path_factory.mktemp("stages")
+    outcome = run("pretrain", *options("pretrain", f"output={folder / 'reference'}"))
+    assert outcome.status == 0, outcome.err
+    outcome = run("collect", *collect_into(folder / "preferences", folder, options))
+    assert outcome.status == 0, outcome.err
+    return folder
+
+
+def collect_into(folder: Path, runs: Path, options: Callable) -> list[str]:
+    return options("collect", f"policy={runs / 'reference/policy.pt'}", f"output={folder}")
+
+
+def weights(path: Path) -> torch.Tensor:
+    return torch.cat([value.flatten().double() for value in load_policy(path)[0].values()])
+
+
+# --- pretrain -------------------------------------------------------------------------------------------------------
+def test_pretraining_writes_a_policy_and_its_curves(runs: Path) -> None:
+    model, context, config = open_policy(runs / "reference/policy.pt")
+    assert model.config.width == 48 and context.horizon == 16
+    assert config["tokenizer"]["name"] == "verlet"
+    losses = read_curve(runs / "reference", "train/loss_next_token")
+    assert [step for step, _ in losses] == [1, 2, 3, 4, 5, 6]
+    assert losses[-1][1] < losses[0][1]
+    assert [step for step, _ in read_curve(runs / "reference", "tune/nll")] == [3, 6]
+
+
+def test_the_weights_that_are_best_on_the_tuning_scenes_are_kept(runs: Path) -> None:
+    *_, metadata = load_policy(runs / "reference/policy.pt")
+    assert metadata["tune_nll"] == pytest.approx(min(value for _, value in read_curve(runs / "reference", "tune/nll")))
+
+
+def test_a_seed_decides_the_policy(run: Callable, options: Callable, runs: Path, tmp_path: Path) -> None:
+    for name, seed in (("same", 0), ("other", 1)):
+        assert run("pretrain", *options("pretrain", f"output={tmp_path / name}", f"seed={seed}")).status == 0
+    reference = weights(runs / "reference/policy.pt")
+    assert torch.equal(weights(tmp_path / "same/policy.pt"), reference)
+    assert not torch.equal(weights(tmp_path / "other/policy.pt"), reference)
+
+
+# --- collect --------------------------------------------------------------------------------------------------------
+def contents(folder: Path) -> dict[int, list]:
+    """Scene -> everything that the store keeps of it."""
+    store = PreferenceStore(folder)
+    return {
+        int(scene): [store[row][key].tolist() for key in (keys.TOKENS, keys.DISTANCE, keys.ADE, keys.RANK)]
+        for row, scene in enumerate(store.scenes)
+    }
+
+
+def test_every_training_scene_gets_a_ranked_group(runs: Path) -> None:
+    store = PreferenceStore(runs / "preferences")
+    assert sorted(store.scenes.tolist()) == list(range(6)), "8 scenes, two of them for tuning"
+    group = store[0]
+    assert group[keys.TOKENS].shape[1] == 4 and group[keys.TOKENS].shape[-1] == 16
+    assert sorted(group[keys.RANK][0].tolist()) == [0, 1, 2, 3]
+    assert (group[keys.DISTANCE][0].argsort(stable=True) == group[keys.RANK][0].argsort()).all()
+
+
+class Stopped(Exception):
+    """Stands for a kill."""
+
+
+def test_collecting_goes_on_where_it_stopped_even_inside_a_group(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = collect_into(tmp_path / "preferences", runs, options)
+    import recipes.collect as collecting
+
+    whole = collecting.collect_groups
+
+    def stop_after_two(*args: object, **kwargs: object) -> Iterator:
+        for number, batch in enumerate(whole(*args, **kwargs)):
+            if number == 2:
+                raise Stopped
+            yield batch
+
+    with monkeypatch.context() as patch:
+        patch.setattr(collecting, "collect_groups", stop_after_two)
+        patch.setattr(
+            collecting.PreferenceWriter, "__exit__", lambda writer, *_: writer._lock.close()
+        )  # as a kill does
+        assert run("collect", *command).status == 1
+    kept = PreferenceStore(tmp_path / "preferences").scenes.tolist()
+    assert 0 < len(kept) < 6
+    assert run("collect", *command).status == 0
+    assert contents(tmp_path / "preferences") == contents(runs / "preferences")
+    order = [PreferenceStore(folder).scenes.tolist() for folder in (tmp_path / "preferences", runs / "preferences")]
+    assert order[0] == order[1]
+
+
+def test_collecting_again_adds_nothing(run: Callable, options: Callable, runs: Path) -> None:
+    before = contents(runs / "preferences")
+    outcome = run("collect", *collect_into(runs / "preferences", runs, options))
+    assert outcome.status == 0 and "preferences of 6 scenes" in outcome.out
+    assert contents(runs / "preferences") == before
+
+
+# --- align ----------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_aligns_the_reference(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path, method: str
+) -> None:
+    outcome = run(
+        "align",
+        *options(
+            "align",
+            f"method={method}",
+            "method.data.num=2",
+            f"policy={runs / 'reference/policy.pt'}",
+            f"preferences={runs / 'preferences'}",
+            f"output={tmp_path / method}",
+        ),
+    )
+    assert outcome.status == 0, outcome.err
+    aligned, reference = weights(tmp_path / method / "policy.pt"), weights(runs / "reference/policy.pt")
+    assert aligned.isfinite().all() and not torch.equal(aligned, reference)
+    *_, metadata = load_policy(tmp_path / method / "policy.pt")
+    assert metadata["method"] == method
+    if method.startswith("sft"):
+        assert len(read_curve(tmp_path / method, "train/loss_next_token")) == 4
+    else:
+        start = read_curve(tmp_path / method, "train/loss_preference")[0][1]
+        assert start == pytest.approx(0.693147, abs=1e-5), "log 2: the policy starts as its own reference"
+
+
+class Scorer(torch.nn.Module):
+    """Gives token 1 the higher likelihood."""
+
+    def forward(self, context: object, tokens: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+        return torch.tensor([0.0, 1.0]).expand(*tokens.shape, 2)
+
+
+def test_pair_accuracy_is_the_share_of_pairs_whose_preferred_rollout_is_likelier() -> None:
+    from dpa.policy import make_context
+
+    context, valid = make_context(straight_road(2)), torch.ones(2, 16, dtype=torch.bool)
+    valid[1, 8:] = False
+    many, few = torch.ones(1, 2, 16, dtype=torch.int64), torch.zeros(1, 2, 16, dtype=torch.int64)
+    hidden = few.clone()
+    hidden[:, 1, 8:] = 1  # more of token 1, but only where it does not count
+    one, two, few_ones = torch.cat((many, few)), torch.cat((few, few)), few.clone()
+    few_ones[:, 0, 0] = 1
+    groups = [Group(context, one, two, valid), Group(context, few_ones, hidden, valid)]
+    assert pair_accuracy(Scorer(), groups, "cpu") == pytest.approx(2 / 3)
+
+
+# --- evaluate -------------------------------------------------------------------------------------------------------
+def score_into(path: Path, runs: Path, options: Callable) -> list[str]:
+    return options("evaluate", f"policy={runs / 'reference/policy.pt'}", f"json={path}")
+
+
+@pytest.fixture(scope="module")
+def scored(run: Callable, options: Callable, runs: Path) -> dict:
+    """The result of an evaluation that nothing interrupted."""
+    outcome = run("evaluate", *score_into(runs / "evaluation.json", runs, options))
+    assert outcome.status == 0, outcome.err
+    assert all(name in outcome.out for name in SCENE_FIGURES)
+    return json.loads((runs / "evaluation.json").read_text())
+
+
+def test_an_evaluation_has_every_figure_of_every_scene_and_their_means(scored: dict, stores: Path) -> None:
+    assert scored["scenes"] == SceneStore(stores / "eval").scene_ids
+    assert set(scored["per_scene"]) == set(scored["mean"]) == set(SCENE_FIGURES)
+    for name, values in scored["per_scene"].items():
+        known = [value for value in values if value is not None]
+        assert len(values) == 3
+        if known:
+            assert scored["mean"][name] == pytest.approx(sum(known) / len(known))
+    assert 0 < scored["mean"]["realism"] <= 1 and scored["mean"]["min_ade"] > 0
+
+
+def test_a_finished_evaluation_is_read_back(
+    run: Callable, options: Callable, runs: Path, scored: dict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(evaluation, "score_group", None)
+    assert run("evaluate", *score_into(runs / "evaluation.json", runs, options)).status == 0
+    assert not list(runs.glob(".evaluation*"))
+
+
+def test_an_evaluation_goes_on_where_it_stopped(
+    run: Callable, options: Callable, runs: Path, scored: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command, seen = score_into(tmp_path / "evaluation.json", runs, options), []
+    whole = evaluation.score_group
+
+    def counted(batch: object, *args: object) -> dict:
+        if len(seen) == 1 and not list(tmp_path.glob("go")):
+            raise Stopped
+        found = whole(batch, *args)
+        seen.append(sorted(found))
+        return found
+
+    monkeypatch.setattr(evaluation, "score_group", counted)
+    assert run("evaluate", *command).status == 1
+    partial = tmp_path / ".evaluation.json.scored"
+    assert partial.is_file() and not (tmp_path / "evaluation.json").exists()
+    with partial.open("a") as file:
+        file.write("[2, {")  # a line that a kill cut short
+    (tmp_path / "go").touch()
+    assert run("evaluate", *command).status == 0
+    assert json.loads((tmp_path / "evaluation.json").read_text()) == scored
+    assert sorted(index for group in seen for index in group) == [0, 1, 2], "no scene is scored twice"
+    assert not partial.exists()
+
+
+def test_what_was_scored_with_other_options_does_not_count(tmp_path: Path) -> None:
+    path = tmp_path / "result.json"
+    PartialResult(path, {"seed": 0}).add({1: {"value": 0.5}})
+    assert PartialResult(path, {"seed": 0}).read() == {1: {"value": 0.5}}
+    assert PartialResult(path, {"seed": 1}).read() == {}
+    assert PartialResult(path, {"seed": 0}).read() == {}, "it went with the run that replaced it"
+
+
+def test_standing_agents_that_rollouts_move_are_counted() -> None:
+    standing, driving = straight_road(2, speed=0.0), straight_road(2, speed=10.0)
+    scene = standing.clone()
+    scene.agents.position[1] = driving.agents.position[1]
+    future = torch.cat((scene.agents.position, scene.agents.heading[..., None]), -1)[:, CURRENT_STEP + 1 :]
+    trajectories = future.repeat(4, 1, 1, 1)
+    assert standing_moved(scene, trajectories) == 0
+    trajectories[:, 1, :, 0] += 50.0  # it drives in the log: no sign of anything
+    assert standing_moved(scene, trajectories) == 0
+    trajectories[0, 0, -1, 0] += 3.0
+    assert standing_moved(scene, trajectories) == pytest.approx(0.25)
+    assert standing_moved(driving, trajectories) != standing_moved(driving, trajectories), "nobody stands: not a number"
+
+
+# --- tokens ---------------------------------------------------------------------------------------------------------
+def test_the_loss_of_tokenization_is_measured(run: Callable, options: Callable, tmp_path: Path) -> None:
+    outcome = run("tokens", *options("tokens", f"json={tmp_path / 'tokens.json'}"))
+    assert outcome.status == 0, outcome.err
+    errors = json.loads((tmp_path / "tokens.json").read_text())["errors"]
+    assert errors["vehicle all"]["position_mean"] < 0.2
+    assert errors["pedestrian all"] == {"poses": 0}
+
+
+# --- jobs -----------------------------------------------------------------------------------------------------------
+def test_jobs_run_here_one_after_the_other() -> None:
+    ran: list[int] = []
+    run_jobs([Job(ran.append, (number,), f"job {number}") for number in range(3)], workers=1, threads=1, name="jobs")
+    assert ran == [0, 1, 2]
+
+
+def test_the_error_of_a_job_is_the_error_of_all() -> None:
+    jobs = [Job(json.loads, ("{",), "bad"), Job(json.loads, ("1",), "good")]
+    with pytest.raises(ValueError, match="Expecting property name"):
+        run_jobs(jobs, workers=2, threads=1, name="jobs")
+
+
+def test_a_killed_worker_is_told_with_what_to_do() -> None:
+    with pytest.raises(ChildProcessError, match="a worker of 'jobs' was killed.*workers=1"):
+        run_jobs([Job(os._exit, (1,), "dies")], workers=2, threads=1, name="jobs")
+
+
+def test_a_number_of_workers_that_is_not_positive_is_refused() -> None:
+    with pytest.raises(ValueError, match="workers must be 1 or more, got 0"):
+        run_jobs([], workers=0, threads=1, name="jobs")
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])
