@@ -9,8 +9,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
+from dpa.losses import ContrastivePreferenceLoss, token_network
+from dpa.policy import MotionLM, make_context
 from dpa.preferences import PreferenceStore
+from dpa.tokens import VerletTokenizer
 from dpa.training.checkpoint import load_policy
 from dpa.training.loggers import read_curve
 from envs import keys
@@ -18,6 +22,7 @@ from envs.scene import CURRENT_STEP
 from envs.sources.synthetic import straight_road
 from envs.store import SceneStore
 from recipes import evaluate as evaluation
+from recipes.align import accumulate
 from recipes.candidates import Group, pair_accuracy
 from recipes.evaluate import SCENE_FIGURES, standing_moved
 from recipes.models import open_policy
@@ -156,6 +161,42 @@ def test_every_method_aligns_the_reference(
         assert start == pytest.approx(0.693147, abs=1e-5), "log 2: the policy starts as its own reference"
 
 
+def test_a_step_is_the_same_however_it_is_split_into_parts() -> None:
+    tokenizer, parts = VerletTokenizer(), []
+    for max_rows in (1, 4, 1000):
+        torch.manual_seed(0)
+        model = MotionLM("nano", tokenizer)
+        loss = ContrastivePreferenceLoss(token_network(model))
+        shake(model)  # away from the reference, where every pair has a gradient of its own
+        figures = accumulate(
+            loss,
+            [group_of(size) for size in (1, 3, 2)],
+            OmegaConf.create({"pairs_per_scene": 2, "max_rows": max_rows}),
+            torch.Generator().manual_seed(0),
+            "cpu",
+        )
+        gradient = torch.cat([p.grad.flatten() for p in model.parameters() if p.grad is not None])
+        parts.append((figures["loss_preference"], figures["logit_mean"], figures["logit_std"], gradient))
+    for split in parts[:2]:
+        for mine, whole in zip(split, parts[2], strict=True):
+            torch.testing.assert_close(mine, whole, atol=1e-5, rtol=1e-3)
+    assert parts[2][2] > 1e-3 and parts[2][3].norm() > 1e-3
+
+
+def group_of(num_agents: int) -> Group:
+    """Three pairs of random rollouts of a road."""
+    draw = torch.Generator().manual_seed(num_agents)
+    tokens = torch.randint(60, 110, (2, 3, num_agents, 16), generator=draw)
+    valid = torch.ones(num_agents, 16, dtype=torch.bool)
+    return Group(make_context(straight_road(num_agents)), tokens[0], tokens[1], valid)
+
+
+def shake(model: torch.nn.Module) -> None:
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.05 * torch.randn(parameter.shape))
+
+
 class Scorer(torch.nn.Module):
     """Gives token 1 the higher likelihood."""
 
@@ -164,8 +205,6 @@ class Scorer(torch.nn.Module):
 
 
 def test_pair_accuracy_is_the_share_of_pairs_whose_preferred_rollout_is_likelier() -> None:
-    from dpa.policy import make_context
-
     context, valid = make_context(straight_road(2)), torch.ones(2, 16, dtype=torch.bool)
     valid[1, 8:] = False
     many, few = torch.ones(1, 2, 16, dtype=torch.int64), torch.zeros(1, 2, 16, dtype=torch.int64)

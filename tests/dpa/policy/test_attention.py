@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dpa.policy.attention import METRES, RelativeAttention
+from dpa.policy.attention import METRES, KeyValues, NodeAttention, NodeMasks, RelativeAttention
 from envs.geometry.frames import rotate, to_local, to_world
 
 WIDTH, HEADS = 32, 2
@@ -121,6 +121,45 @@ def test_at_the_start_of_training_the_gaze_rests_on_the_agent_itself() -> None:
 def test_a_width_that_heads_do_not_divide_is_refused() -> None:
     with pytest.raises(ValueError, match="multiple of heads, got 32 and 3"):
         RelativeAttention(32, heads=3)
+
+
+# --- between nodes --------------------------------------------------------------------------------------------------
+AGENTS, DECISIONS = 3, 4
+
+
+def node_attention() -> NodeAttention:
+    torch.manual_seed(0)
+    attention = NodeAttention(WIDTH, heads=4)
+    torch.nn.init.normal_(attention.gaze.weight, std=0.3)
+    return attention
+
+
+def staircase() -> NodeMasks:
+    """What nodes see in one pass: the own past, and everybody up to the own decision."""
+    own = torch.ones(DECISIONS, DECISIONS, dtype=torch.bool).tril()
+    return NodeMasks(own, own.repeat_interleave(AGENTS, 0).repeat_interleave(AGENTS, 1))
+
+
+@torch.no_grad()
+def test_some_heads_see_the_own_past_only_and_the_others_everybody() -> None:
+    attention, (x, pose) = node_attention(), tokens(AGENTS * DECISIONS, 1)
+    assert attention.own == 1 and attention.heads == 4
+    masks, memory = staircase(), attention.remember(x, pose)
+    agent = torch.arange(AGENTS).repeat(DECISIONS)
+    own_past = masks.everybody & (agent[:, None] == agent)
+    each_head = torch.stack((own_past, *[masks.everybody] * 3))
+    plain = RelativeAttention.forward(attention, x, pose, memory, each_head)
+    torch.testing.assert_close(attention(x, pose, memory, masks, AGENTS), plain, atol=1e-5, rtol=1e-4)
+
+
+@torch.no_grad()
+def test_the_last_decision_can_be_attended_from_alone() -> None:
+    attention, (x, pose) = node_attention(), tokens(AGENTS * DECISIONS, 1)
+    masks, memory = staircase(), attention.remember(x, pose)
+    whole = attention(x, pose, memory, masks, AGENTS)[:, -AGENTS:]
+    last = NodeMasks(masks.own[-1:], masks.everybody[-AGENTS:])
+    alone = attention(x[:, -AGENTS:], pose[:, -AGENTS:], KeyValues(*memory), last, AGENTS)
+    torch.testing.assert_close(alone, whole, atol=1e-5, rtol=1e-4)
 
 
 if __name__ == "__main__":
