@@ -73,7 +73,7 @@ def make_collector(
     """A collector that takes the scenes in turn, ``num_scenes`` at a time, and yields whole episodes ``[S * K, T]``.
 
     Args:
-        scenes: where scenes come from; when S does not divide their number, the last batch goes on with the first scenes.
+        scenes: where scenes come from; when S does not divide their number, the last batch goes on with the first ones.
         model: what drives.
 
     Keyword Args:
@@ -165,8 +165,8 @@ def collect_groups(
 ) -> Iterator[TensorDict]:
     """Roll out scenes group by group, each group in one collector batch.
 
-    The groups depend on ``indices`` and a group's seed on its scenes, so what is left of an interrupted collection comes
-    out as it would have: ask for the same indices again, with those that are ``done``.
+    The groups depend on ``indices`` and a group's seed on its scenes, so what is left of an interrupted collection
+    comes out as it would have: ask for the same indices again, with those that are ``done``.
 
     Args:
         scenes: all scenes.

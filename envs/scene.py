@@ -253,7 +253,10 @@ class Scene(TensorClass["nocast"]):
                     f"{name}: track {int(agents.track_id[agent])} has {field} {bad} at a valid step; mark it invalid."
                 )
         if not (agents.extent[agents.present] > 0).all():
-            raise SceneError(f"{name}: an agent at the current step has an extent (length, width, height) that is not positive.")
+            raise SceneError(
+                f"{name}: an agent at the current step has an extent (length, width, height) that is not positive; "
+                "give its box, or mark it invalid."
+            )
         if not torch.isfinite(road.points).all():
             raise SceneError(f"{name}: a map point is not finite; remove the polyline.")
         edges = torch.isin(road.kind, torch.tensor(EDGE_KINDS)) & (road.count >= 2)

@@ -22,12 +22,13 @@ class TrafficEnv(EnvBase):
     """S traffic scenes, K times each, as one environment of batch size ``[B] = [S * K]``.
 
     An episode starts at the current step of a log, with one second of history, and takes ``horizon`` decisions of
-    ``decision_steps`` poses. The agents of a scene are those valid at its current step, in the order of the scene, padded
-    to ``num_agents``. Up to ``max_controlled`` of them follow their actions to the end: evaluated agents first, then
-    those nearest to the SDC. The rest follow their log, and ``("agents", "controlled")`` says which.
+    ``decision_steps`` poses. The agents of a scene are those valid at its current step, in the order of the scene,
+    padded to ``num_agents``. Up to ``max_controlled`` of them follow their actions to the end: evaluated agents first,
+    then those nearest to the SDC. The rest follow their log, and ``("agents", "controlled")`` says which.
 
     The K rollouts of a scene are contiguous rows. A scene gives way to the next one when all its rows are reset; a row
-    that is reset alone starts its scene again. The map stays out of the observations: ``scene`` is its index in ``scenes``.
+    that is reset alone starts its scene again. The map stays out of the observations: ``scene`` is its index in
+    ``scenes``.
 
     Specs (shapes in :mod:`envs.keys`): observations ``scene``, ``step`` and, under ``agents``, ``recent``, ``valid``,
     ``controlled``, ``kind``; action ``("agents", "action")``: the next F poses in the agent's own frame; reward
@@ -168,8 +169,8 @@ class TrafficEnv(EnvBase):
         missing = self.num_agents - scene.agents.kind.shape[0]
         if missing < 0:
             raise ValueError(
-                f"scene {scene.scene_id} has {self.num_agents - missing} agents at the current step and the environment "
-                f"holds {self.num_agents}; raise num_agents."
+                f"scene {scene.scene_id} has {self.num_agents - missing} agents at the current step and the "
+                f"environment holds {self.num_agents}; raise num_agents."
             )
         return pad_agents(scene, missing)
 

@@ -19,6 +19,7 @@ from torchrl.objectives import LossModule
 from dpa.losses import ContrastivePreferenceLoss, NextTokenLoss, token_network
 from dpa.policy import MotionLM
 from dpa.preferences import PreferenceStore
+from dpa.report.figures import read_curves
 from dpa.training.batches import Item, ShuffledOrder, collate_items, micro_batches
 from dpa.training.optim import clip_and_step, make_optimizer, make_schedule
 from dpa.training.run import Run
@@ -26,7 +27,7 @@ from dpa.training.seeding import make_generator, seed_everything
 from envs import keys
 from envs.store import SceneStore
 from recipes.candidates import Group, make_candidates
-from recipes.cli import CONFIG, build, plain, recipe
+from recipes.cli import CONFIG, build, finished, plain, recipe, write_json
 from recipes.models import open_policy, weights_digest, write_policy
 from recipes.scenes import fingerprint, open_splits
 
@@ -54,7 +55,7 @@ def align(
     Raises:
         ValueError: preferences of other scenes or of another policy, an unknown loss, or options that do not fit it.
     """
-    options, path = cfg.alignment, folder / "policy.pt"
+    options, path, result = cfg.alignment, folder / "policy.pt", folder / "result.json"
     model, context, config = open_policy(policy, cfg.device)
     store = PreferenceStore(preferences)
     if store.provenance.scenes != fingerprint(scenes):
@@ -68,6 +69,8 @@ def align(
         "reference": weights_digest(model),
         "preferences": store.provenance.policy,
     }
+    if finished(result, decided_by) is not None:
+        return path
     seed_everything(seed)
     candidates = make_candidates(method.data, store, scenes, context, model.tokenizer.cpu(), seed)
     loss = make_loss(method.loss, model.to(cfg.device).train())
@@ -91,6 +94,8 @@ def align(
             norm = clip_and_step(optimizer, options.max_norm, schedule)
             run.log({f"train/{key}": value for key, value in losses.items()} | {"train/gradient_norm": norm})
     write_policy(path, model, config, {"method": method.name, "seed": seed, "options": decided_by})
+    last = {name: curve["value"][-1] for name, curve in read_curves(folder).items()}
+    write_json(result, {"options": decided_by, "policy": str(path), "last_step": last})
     return path
 
 

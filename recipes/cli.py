@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 CONFIG = {"version_base": "1.3", "config_path": str(Path(__file__).parent / "config")}
-"""Arguments of ``hydra.main`` that all recipes share. An absolute path, so that ``main`` may also be imported and called."""
+"""Arguments of ``hydra.main`` that all recipes share; with an absolute path, ``main`` may also be imported."""
 USER_ERRORS = (ValueError, OSError, ImportError, FloatingPointError, HydraException, OmegaConfBaseException)
 
 
@@ -68,6 +68,11 @@ def write_json(path: str | Path, content: Any) -> None:
     part = path.with_name(f".{path.name}.part")
     part.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     part.replace(path)
+
+
+def finite(value: float) -> float | None:
+    """The value, or ``None`` in place of a NaN, as JSON can hold it."""
+    return value if value == value else None
 
 
 def finished(path: Path, decided_by: dict[str, Any]) -> dict[str, Any] | None:

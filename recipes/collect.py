@@ -8,19 +8,20 @@ Run the same command again to go on after a kill.
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 import hydra
 from omegaconf import DictConfig
 
-from dpa.preferences import PreferenceStore, PreferenceWriter, Provenance
+from dpa.preferences import PreferenceStore, PreferenceWriter, Provenance, data_card
 from dpa.ranking import PreferenceDistance
 from dpa.ranking.transform import RankRollouts
 from dpa.rollout import Decoding, collect_groups
 from envs import keys
 from envs.progress import progress
 from envs.store import SceneStore
-from recipes.cli import CONFIG, build, plain, recipe
+from recipes.cli import CONFIG, build, finite, plain, recipe, write_json
 from recipes.models import open_policy, weights_digest
 from recipes.scenes import fingerprint, open_splits
 
@@ -76,6 +77,8 @@ def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.collect``."""
     scenes = open_splits(cfg.scenes)[cfg.split]
     store = collect(cfg, scenes, Path(cfg.policy), cfg.seed, Path(cfg.output))
+    if cfg.json is not None:
+        write_json(cfg.json, {name: finite(value) for name, value in asdict(data_card(store)).items()})
     print(f"preferences of {len(store)} scenes: {cfg.output}")
 
 

@@ -22,7 +22,7 @@ from envs import keys
 from envs.progress import progress
 from envs.scene import CURRENT_STEP, SceneSource
 from envs.store import SceneStore
-from recipes.cli import CONFIG, build, finished, plain, recipe, write_json
+from recipes.cli import CONFIG, build, finished, finite, plain, recipe, write_json
 from recipes.models import open_policy, weights_digest
 from recipes.partial import PartialResult
 from recipes.scenes import fingerprint, open_splits
@@ -55,8 +55,8 @@ def evaluate(cfg: DictConfig, scenes: SceneStore, policy: Path, top_p: float, se
         path: JSON to write.
 
     Returns:
-        ``options``, ``mean`` (each figure of :data:`SCENE_FIGURES`), ``likelihood`` (of each realism feature), ``scenes``
-        (ids) and ``per_scene`` (each figure as a list).
+        ``options``, ``mean`` (each figure of :data:`SCENE_FIGURES`), ``likelihood`` (of each realism feature),
+        ``scenes`` (ids) and ``per_scene`` (each figure as a list).
     """
     options = cfg.evaluation
     model, context, _ = open_policy(policy, cfg.device)
@@ -136,10 +136,10 @@ def summarise(scored: list[dict[str, Any]], scene_ids: list[str]) -> dict[str, A
     """Means over scenes and the figures of each, from what :func:`score_group` gives for each scene."""
     results = [RealismResult(**entry["result"]) for entry in scored]
     figures = [result.as_dict() | entry for result, entry in zip(results, scored, strict=True)]
-    per_scene = {name: [_finite(figure[name]) for figure in figures] for name in SCENE_FIGURES}
+    per_scene = {name: [finite(figure[name]) for figure in figures] for name in SCENE_FIGURES}
     return {
         "mean": {name: _mean(values) for name, values in per_scene.items()},
-        "likelihood": {name: _finite(value) for name, value in mean_result(results).likelihood.items()},
+        "likelihood": {name: finite(value) for name, value in mean_result(results).likelihood.items()},
         "scenes": scene_ids,
         "per_scene": per_scene,
     }
@@ -160,10 +160,6 @@ def standing_moved(scene: Any, trajectories: torch.Tensor) -> float:
         return float("nan")
     moved = (trajectories[:, standing, -1, :2] - xy[standing, 0]).norm(dim=-1) > MOVED
     return moved.float().mean().item()
-
-
-def _finite(value: float) -> float | None:
-    return value if value == value else None
 
 
 def _mean(values: list[float | None]) -> float | None:

@@ -51,20 +51,22 @@ def run_jobs(jobs: list[Job], workers: int, threads: int, name: str) -> None:
     context = multiprocessing.get_context("spawn")
     started, lock = context.Value("i", 0), context.RLock()
     use_line(0, lock)
-    with progress(total=len(jobs), description=name, unit="job") as bar:
-        with ProcessPoolExecutor(workers, context, _start, (lock, started)) as pool:
-            futures = [pool.submit(_work, job, threads) for job in jobs]
-            try:
-                for future in as_completed(futures):
-                    future.result()
-                    bar.update()
-            except BrokenProcessPool as error:
-                raise ChildProcessError(
-                    f"a worker of {name!r} was killed, perhaps for want of memory; run it again with workers=1."
-                ) from error
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+    with (
+        progress(total=len(jobs), description=name, unit="job") as bar,
+        ProcessPoolExecutor(workers, context, _start, (lock, started)) as pool,
+    ):
+        futures = [pool.submit(_work, job, threads) for job in jobs]
+        try:
+            for future in as_completed(futures):
+                future.result()
+                bar.update()
+        except BrokenProcessPool as error:
+            raise ChildProcessError(
+                f"a worker of {name!r} was killed, perhaps for want of memory; run it again with workers=1."
+            ) from error
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 def _start(lock: Any, started: Any) -> None:

@@ -25,7 +25,7 @@ from envs import keys
 from envs.augment import mirror
 from envs.progress import progress
 from envs.scene import SceneSource
-from recipes.cli import CONFIG, plain, recipe
+from recipes.cli import CONFIG, finished, plain, recipe, write_json
 from recipes.models import build_policy, context_options, policy_config, write_policy
 from recipes.scenes import Splits, fingerprint, open_splits
 
@@ -42,9 +42,11 @@ def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path) -> Path:
     Returns:
         The file of the policy.
     """
-    path, options = folder / "policy.pt", cfg.pretraining
+    path, result, options = folder / "policy.pt", folder / "result.json", cfg.pretraining
     config = policy_config(cfg.model)
     decided_by = {"policy": config, "pretraining": plain(options), "seed": seed, "scenes": fingerprint(splits.train)}
+    if finished(result, decided_by) is not None:
+        return path
     seed_everything(seed)
     model = build_policy(config).to(cfg.device)
     best = copy.deepcopy(model)
@@ -80,6 +82,7 @@ def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path) -> Path:
                     run.state["best_nll"] = measured["nll"]
                     best.load_state_dict(model.state_dict())
     write_policy(path, best, config, {"method": "reference", "seed": seed, "tune_nll": run.state["best_nll"]})
+    write_json(result, {"options": decided_by, "policy": str(path), "tune_nll": run.state["best_nll"]})
     return path
 
 

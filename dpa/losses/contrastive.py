@@ -24,11 +24,12 @@ class ContrastivePreferenceLoss(LossModule):
     """Raises the likelihood of preferred rollouts over that of unpreferred ones of the same scene.
 
     With the score of a rollout ``A = alpha * reduce(log pi - log pi_ref)`` over its valid tokens, a pair costs
-    ``softplus(lambda * A_unpreferred - A_preferred)`` (eq. 4; ``reference=False`` leaves ``log pi_ref`` out, as the paper does).
+    ``softplus(lambda * A_unpreferred - A_preferred)`` (eq. 4; ``reference=False`` leaves ``log pi_ref`` out, as the
+    paper does).
 
     The default starts with equal weights for all pairs, because both scores are 0. The plain sum without a reference
-    starts with scores of hundreds of nats: nearly every pair then has weight 0 or 1, improbable winners dominate and the
-    policy flattens (watch ``logit_std`` and ``saturated`` at the first step, and ``entropy`` later).
+    starts with scores of hundreds of nats: nearly every pair then has weight 0 or 1, improbable winners dominate and
+    the policy flattens (watch ``logit_std`` and ``saturated`` at the first step, and ``entropy`` later).
 
     Args:
         actor_network: from :func:`~dpa.losses.token_network`.
@@ -37,16 +38,16 @@ class ContrastivePreferenceLoss(LossModule):
         alpha: scale of a score (1 / temperature of the preference model).
         conservative: lambda in (0, 1], the factor on the unpreferred score (Hejna et al. 2024).
         reference: subtract the log-likelihood under a frozen copy of the network as it is now.
-        score_reduction: ``"sum"`` over agents and decisions as in eq. 4, ``"agent_mean"`` sums over decisions and averages
-            over agents, ``"token_mean"`` averages over both.
+        score_reduction: ``"sum"`` over agents and decisions as in eq. 4, ``"agent_mean"`` sums over decisions and
+            averages over agents, ``"token_mean"`` averages over both.
         cloning: weight of the negative log-likelihood per token of the preferred rollouts.
 
     Raises:
         ValueError: an option outside its range.
 
-    Returns ``loss_preference``, ``loss_cloning`` and, detached: ``logit_mean``, ``logit_std``, ``weight_mean`` and ``saturated``
-    of the pairs, ``pair_accuracy`` (the preferred rollout is the more likely one), ``nll_preferred``, ``nll_unpreferred`` and
-    ``entropy`` per token [nats] and, with a reference, ``kl`` to it per token [nats].
+    Returns ``loss_preference``, ``loss_cloning`` and, detached: ``logit_mean``, ``logit_std``, ``weight_mean`` and
+    ``saturated`` of the pairs, ``pair_accuracy`` (the preferred rollout is the more likely one), ``nll_preferred``,
+    ``nll_unpreferred`` and ``entropy`` per token [nats] and, with a reference, ``kl`` to it per token [nats].
 
     Examples:
         >>> from dpa.losses import token_network
@@ -126,11 +127,13 @@ class ContrastivePreferenceLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
+        """Where the input lies, in the order in which plain tensors are taken."""
         accepted = self.tensor_keys
         return [accepted.context, accepted.preferred, accepted.unpreferred, accepted.token_valid]
 
     @property
     def out_keys(self) -> list[str]:
+        """``loss_preference``, ``loss_cloning`` and the diagnostics."""
         return ["loss_preference", "loss_cloning", *self.diagnostics, *(["kl"] if self.reference else [])]
 
     def _forward_value_estimator_keys(self, **_: object) -> None:
@@ -138,6 +141,7 @@ class ContrastivePreferenceLoss(LossModule):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The loss and its diagnostics, each a scalar, of a batch of pairs."""
         accepted = self.tensor_keys
         tokens = torch.cat((tensordict[accepted.preferred], tensordict[accepted.unpreferred]), 1)
         valid = tensordict[accepted.token_valid]
@@ -162,7 +166,8 @@ class ContrastivePreferenceLoss(LossModule):
             likelier = torch.gt(*self._reduce(log_prob, valid).chunk(2, 1))
             out |= _pair_diagnostics(logit.detach())
             out |= {"pair_accuracy": likelier.to(logit.dtype).mean(), "nll_preferred": nll.detach()}
-            out |= {"nll_unpreferred": nll_unpreferred.detach(), "entropy": masked_mean(_entropy(logits), valid), **drift}
+            out |= {"nll_unpreferred": nll_unpreferred.detach(), "entropy": masked_mean(_entropy(logits), valid)}
+            out |= drift
         return TensorDict(out, batch_size=[])
 
     def _reduce(self, value: Tensor, valid: Tensor) -> Tensor:

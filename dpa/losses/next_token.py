@@ -16,7 +16,8 @@ from envs import keys
 class NextTokenLoss(LossModule):
     """Negative log-likelihood of tokens, per valid token [nats] (eq. 1).
 
-    Pre-training reads the tokens of logs; SFT-best reads those of the best rollouts as new labels. Nothing else differs.
+    Pre-training reads the tokens of logs; SFT-best reads those of the best rollouts as new labels. Nothing else
+    differs.
 
     Args:
         actor_network: from :func:`~dpa.losses.token_network`.
@@ -24,8 +25,8 @@ class NextTokenLoss(LossModule):
     Keyword Args:
         label_smoothing: share of the target spread over all tokens.
 
-    Returns ``loss_next_token`` and, detached, ``accuracy`` (share of tokens that are the most probable ones) and ``entropy``
-    [nats].
+    Returns ``loss_next_token`` and, detached, ``accuracy`` (share of tokens that are the most probable ones) and
+    ``entropy`` [nats].
 
     Examples:
         >>> from dpa.losses import token_network
@@ -77,6 +78,7 @@ class NextTokenLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
+        """Where the input lies, in the order in which plain tensors are taken."""
         accepted = self.tensor_keys
         return list(dict.fromkeys((accepted.context, accepted.tokens, accepted.labels, accepted.token_valid)))
 
@@ -85,6 +87,7 @@ class NextTokenLoss(LossModule):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The loss and its diagnostics, each a scalar, of a batch of rollouts."""
         accepted = self.tensor_keys
         tokens, valid = tensordict[accepted.tokens], tensordict[accepted.token_valid]
         batch = TensorDict(

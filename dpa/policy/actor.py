@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from dpa.policy.context import ContextOptions, SceneContext, collate_contexts, make_context
+from dpa.policy.context import AGENT_FIELDS, ContextOptions, SceneContext, collate_contexts, make_context
 from dpa.policy.decoder import NodeCache, NodeInputs, SceneMemory
 from dpa.policy.motionlm import MotionLM
 from envs import keys
@@ -101,6 +101,7 @@ class MotionActor(TensorDictModuleBase):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write a token for every agent and its log-probability."""
         logits = self.logits(tensordict)
         token = self._sample(logits)
         self._last = token
@@ -188,7 +189,7 @@ def pad_context(context: SceneContext, agents: int) -> SceneContext:
     if missing < 0:
         raise ValueError(f"the contexts hold {context.kind.shape[1]} agents and the environment {agents}.")
     context = context.clone(recurse=False)
-    for name in ("history", "history_valid", "extent", "kind", "recent", "valid", "controlled", "logged", "logged_valid"):
+    for name in AGENT_FIELDS:
         value = getattr(context, name)
         setattr(context, name, torch.cat((value, value.new_zeros(len(value), missing, *value.shape[2:])), 1))
     return context

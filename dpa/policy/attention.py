@@ -2,12 +2,12 @@
 
 Every token has a pose. Writing ``g`` for the rigid motion of a pose and ``rho(g)`` for its 3 x 3 matrix, the product
 ``rho(g_i)^-1 rho(g_j)`` depends on the pose of j seen from i only. So queries, keys and values are split into blocks of
-three channels, each multiplied by the matrix of its OWN token, and the output by the inverse matrix of the query: scores
-and values then hold relative poses, nothing of size (queries x keys) is built but the scores, and keys and values can
-be cached in the frame of the scene (cf. Miyato et al., "GTA", ICLR 2024).
+three channels, each multiplied by the matrix of its OWN token, and the output by the inverse matrix of the query:
+scores and values then hold relative poses, nothing of size (queries x keys) is built but the scores, and keys and
+values can be cached in the frame of the scene (cf. Miyato et al., "GTA", ICLR 2024).
 
-On top each query has a *gaze*: a point that it chooses in its own frame and a width. The log-weight ``-w |c_i - x_j|^2 / 2``
-is linear in features of j up to a term that softmax cancels, so it costs three more channels.
+On top each query has a *gaze*: a point that it chooses in its own frame and a width. The log-weight
+``-w |c_i - x_j|^2 / 2`` is linear in features of j up to a term that softmax cancels, so it costs three more channels.
 """
 
 from __future__ import annotations

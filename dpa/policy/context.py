@@ -102,6 +102,10 @@ class SceneContext(TensorClass["nocast"]):
     logged_valid: Tensor
 
 
+AGENT_FIELDS = ("history", "history_valid", "extent", "kind", "recent", "valid", "controlled", "logged", "logged_valid")
+"""Fields of a :class:`SceneContext` that have one row for each agent."""
+
+
 def make_context(scene: Scene, options: ContextOptions | None = None) -> SceneContext:
     """Cut up one uncollated scene; its agents are those present at the current step, in order.
 
@@ -155,7 +159,7 @@ def collate_contexts(contexts: Sequence[SceneContext]) -> SceneContext:
 def keep_agents(context: SceneContext, index: Tensor) -> SceneContext:
     """Keep some agents of one uncollated context."""
     context = context.clone(recurse=False)
-    for name in ("history", "history_valid", "extent", "kind", "recent", "valid", "controlled", "logged", "logged_valid"):
+    for name in AGENT_FIELDS:
         setattr(context, name, getattr(context, name)[index])
     return context
 

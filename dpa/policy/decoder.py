@@ -1,8 +1,8 @@
 """Causal decoder over agents x decisions, with a cache (METHOD section 2).
 
-A *node* is an agent at the start of a decision. It knows the motion that it just made (its last token), when it is and who
-it is. It attends to the nodes of all agents up to its own decision, which hold the tokens of earlier decisions only (the
-block staircase), and to the encoded scene, both seen from where the agent is NOW.
+A *node* is an agent at the start of a decision. It knows the motion that it just made (its last token), when it is and
+who it is. It attends to the nodes of all agents up to its own decision, which hold the tokens of earlier decisions only
+(the block staircase), and to the encoded scene, both seen from where the agent is NOW.
 """
 
 from __future__ import annotations
@@ -79,6 +79,7 @@ class DecoderLayer(nn.Module):
     def forward(
         self, x: Tensor, pose: Tensor, nodes: KeyValues, masks: NodeMasks, memory: SceneMemory, index: int
     ) -> Tensor:
+        """Nodes ``x`` ``[B, Q, width]`` after layer ``index``; ``nodes`` are all that they may look at."""
         agents, scene = memory.agents.shape[1], memory.layers[index]
         x = x + self.dropout(self.nodes(self.norm_nodes(x), pose, nodes, masks, agents))
         # The scene is shared by its rollouts: fold them into the queries instead of repeating keys and values.

@@ -46,6 +46,7 @@ class EncoderLayer(nn.Module):
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, x: Tensor, pose: Tensor, mask: Tensor) -> Tensor:
+        """Tokens ``x`` ``[S, n, width]`` after the layer; ``mask`` says which of them are looked at."""
         normed = self.norm(x)
         x = x + self.dropout(self.attention(normed, pose, self.attention.remember(normed, pose), mask))
         return x + self.dropout(self.feed(self.norm_feed(x)))

@@ -80,9 +80,7 @@ class MotionLM(nn.Module):
         self.tokenizer = tokenizer
         size = (config.width, config.heads, config.feed)
         self.encoder = SceneEncoder(*size, config.encoder_layers, config.dropout)
-        self.decoder = MotionDecoder(
-            tokenizer.vocab_size, *size, config.decoder_layers, config.horizon, config.dropout
-        )
+        self.decoder = MotionDecoder(tokenizer.vocab_size, *size, config.decoder_layers, config.horizon, config.dropout)
 
     @property
     def no_token(self) -> int:
@@ -156,7 +154,8 @@ def node_validity(context: SceneContext, token_valid: Tensor) -> Tensor:
         token_valid: ``[S, M, A, T]`` bool.
 
     Returns:
-        ``[S, M, A, T]`` bool: a controlled agent counts while the tokens before are valid, a replayed one while it is logged.
+        ``[S, M, A, T]`` bool: a controlled agent counts while the tokens before are valid, a replayed one while it is
+        logged.
     """
     horizon = token_valid.shape[-1]
     present = context.valid[:, None, :, None].expand(*token_valid.shape[:-1], 1)

@@ -32,8 +32,8 @@ class MotionTokenizer(nn.Module):
     """Maps one token to the F next poses of an agent, and back.
 
     A tokenizer has no memory: what it needs of the past it reads from ``recent``, the poses of the last decision. A
-    subclass gives ``vocab_size``, ``steps`` (F), :meth:`encode`, :meth:`decode` and :meth:`neighbour`; tables and bin sizes
-    are buffers.
+    subclass gives ``vocab_size``, ``steps`` (F), :meth:`encode`, :meth:`decode` and :meth:`neighbour`; tables and bin
+    sizes are buffers.
 
     Attributes:
         vocab_size: V.

@@ -39,6 +39,7 @@ class TokenAction(Transform):
         return tensordict.set(keys.ACTION, action)
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Tokens in the place of poses."""
         action = input_spec["full_action_spec"]
         poses = action[keys.ACTION]
         if poses.shape[-2] != self.tokenizer.steps:

@@ -87,12 +87,14 @@ class VerletTokenizer(MotionTokenizer):
         self.register_buffer("turn", _by_kind("turn", turn, 1)[:, 0])
 
     def encode(self, target: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
+        """The change of displacement that ends nearest to the target, at most six bins each way."""
         end = self._from_own_frame(target[..., -1, :2], recent)
         bins = (end / self.bins[kind]).round()
         change = (bins - self._last_bins(recent, kind)).clamp(-(CHANGES // 2), CHANGES // 2).long() + CHANGES // 2
         return change[..., 0] * CHANGES + change[..., 1]
 
     def decode(self, token: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
+        """The motion at the changed displacement, at most :data:`MAX_BIN` bins each way."""
         change = torch.stack((token // CHANGES, token % CHANGES), -1) - CHANGES // 2
         last_bins = self._last_bins(recent, kind)
         bins = (last_bins + change).clamp(-MAX_BIN, MAX_BIN)
@@ -101,6 +103,7 @@ class VerletTokenizer(MotionTokenizer):
         return torch.cat((xy, self._headings(xy, kind)[..., None]), -1)
 
     def neighbour(self, token: Tensor, kind: Tensor, generator: torch.Generator | None) -> Tensor:
+        """A change of at most one bin more or less in each direction."""
         change = torch.stack((token // CHANGES, token % CHANGES), -1)
         step = torch.randint(-1, 2, change.shape, generator=generator, device=token.device)
         change = (change + step).clamp(0, CHANGES - 1)
@@ -131,7 +134,7 @@ class VerletTokenizer(MotionTokenizer):
         return (share * start[..., None, :]) + share**2 * (end - start)[..., None, :]
 
     def _headings(self, xy: Tensor, kind: Tensor) -> Tensor:
-        """``[*, F]``: the heading follows the motion, no faster than ``turn``; standing holds it, reversing keeps it."""
+        """``[*, F]``: the heading follows the motion, no faster than ``turn``; standing and reversing keep it."""
         moves = torch.diff(xy, dim=-2, prepend=torch.zeros_like(xy[..., :1, :]))
         # Move by move: whoever brakes to a stop at constant acceleration rolls back a little at the end.
         backward = moves[..., 0] < 0
@@ -145,4 +148,6 @@ class VerletTokenizer(MotionTokenizer):
         return wrap_angle(torch.stack(headings, -1))
 
     def extra_repr(self) -> str:
-        return f"V={self.vocab_size}, F={self.steps} ({self.steps * STEP_SECONDS:.1f} s), {self.interpolation}, {self.frame}"
+        """Options, for ``print``."""
+        seconds = self.steps * STEP_SECONDS
+        return f"V={self.vocab_size}, F={self.steps} ({seconds:.1f} s), {self.interpolation}, {self.frame}"

@@ -65,9 +65,7 @@ class Run:
             restore(saved, parts)
             self.state = dict(saved["progress"])
         self.first_step = 0 if saved is None else saved["step"]
-        self._logger = make_logger(
-            backend, self.folder, config, resume_step=saved and saved["step"], mode=mode
-        )
+        self._logger = make_logger(backend, self.folder, config, resume_step=saved and saved["step"], mode=mode)
         self._step = self.first_step
 
     def steps(self) -> Iterator[int]:

@@ -56,9 +56,9 @@ def test_the_demo_has_a_configuration(run: Callable) -> None:
 
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_an_unknown_key_is_told_by_name(run: Callable, recipe: str) -> None:
-    outcome = run(recipe, "scenes.trian=somewhere")
+    outcome = run(recipe, "scenes.trains=somewhere")
     assert outcome.status == 1
-    assert "Key 'trian' is not in struct" in outcome.err and "Traceback" not in outcome.err
+    assert "Key 'trains' is not in struct" in outcome.err and "Traceback" not in outcome.err
 
 
 @pytest.mark.parametrize("recipe", ["collect", "align", "evaluate"])
