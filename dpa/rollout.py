@@ -15,6 +15,7 @@ from dpa.policy.actor import Contexts, MotionActor
 from dpa.policy.context import ContextOptions
 from dpa.policy.motionlm import MotionLM
 from dpa.tokens import TokenAction
+from dpa.training.batches import micro_batches
 from dpa.training.seeding import derive_seed
 from envs import keys
 from envs.geometry.ground import lift
@@ -140,13 +141,9 @@ def groups_by_size(scenes: SceneSource, indices: Sequence[int], max_rows: int, n
     """
     counts = getattr(scenes, "num_agents", None)
     size = {i: int(counts[i] if counts is not None else scenes[i].agents.present.sum()) for i in indices}
-    groups: list[list[int]] = []
-    for index in sorted(indices, key=lambda i: (size[i], i)):
-        if groups and (len(groups[-1]) + 1) * size[index] * num_rollouts <= max_rows:
-            groups[-1].append(index)
-        else:
-            groups.append([index])
-    return groups
+    ordered = list(indices)
+    parts = micro_batches([size[index] * num_rollouts for index in ordered], max_rows)
+    return [[ordered[position] for position in part] for part in parts]
 
 
 def collect_groups(

@@ -86,7 +86,7 @@ class RelativeAttention(nn.Module):
         key, value = self._split(self.key_value(x), 2)
         pose = pose[:, None]
         xy = (pose[..., :2] / METRES).expand(*key.shape[:-1], 2)
-        window = torch.cat((xy, -xy.square().sum(-1, keepdim=True) / 2), -1)
+        window = torch.cat((xy, -(xy[..., :1] ** 2 + xy[..., 1:] ** 2) / 2), -1)
         return KeyValues(torch.cat((self._move(key, pose), window), -1), F.pad(self._move(value, pose), (0, 3)))
 
     def forward(self, x: Tensor, pose: Tensor, memory: KeyValues, mask: Tensor | None = None) -> Tensor:
@@ -137,7 +137,8 @@ class RelativeAttention(nn.Module):
         """Multiply by rho(g)^-T, scaled as in dot-product attention, so that q . k = x^T rho(g_i^-1 g_j) key."""
         vector, weight, rest = self._blocks(x * self.dim**-0.5)
         vector = rotate(vector, pose[..., 2:])
-        weight = weight - (vector * pose[..., None, :2] / METRES).sum(-1)
+        x, y = vector.unbind(-1)
+        weight = weight - (x * pose[..., :1] + y * pose[..., 1:2]) / METRES
         return torch.cat((vector.flatten(-2), weight, rest), -1)
 
     def _back(self, x: Tensor, pose: Tensor) -> Tensor:

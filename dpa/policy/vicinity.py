@@ -65,9 +65,11 @@ class Vicinity(nn.Module):
     @torch.no_grad()
     def _nearest(self, pose: Tensor, token_pose: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
         """Distances ``[B, Q, k]`` (infinite where there is nothing) and indices of the nearest tokens."""
-        offset = pose[:, :, None, :2] - token_pose[:, None, :, :2]
-        distance = offset.square().sum(-1).sqrt().masked_fill(~mask, torch.inf)
-        return distance.topk(min(self.nearest, distance.shape[-1]), largest=False)
+        dx = pose[:, :, None, 0] - token_pose[:, None, :, 0]
+        dy = pose[:, :, None, 1] - token_pose[:, None, :, 1]
+        square = torch.addcmul(dx.square(), dy, dy).masked_fill(~mask, torch.inf)
+        near, index = square.topk(min(self.nearest, square.shape[-1]), largest=False, sorted=False)
+        return near.sqrt(), index
 
 
 LOWEST = -1.0

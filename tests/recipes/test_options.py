@@ -104,6 +104,8 @@ def test_a_run_does_not_go_on_with_a_policy_of_another_size(
 ) -> None:
     shutil.copytree(runs / "reference", tmp_path / "reference")
     command = options("pretrain", f"output={tmp_path / 'reference'}", "pretraining.steps=2", "model=small")
+    assert_refused(run("pretrain", *command), "result.json was written with other options (policy)")
+    (tmp_path / "reference/result.json").unlink()  # as if the run had not finished
     assert_refused(run("pretrain", *command), "'width': 48", "'width': 64")
 
 

@@ -75,6 +75,14 @@ def test_a_seed_decides_the_policy(run: Callable, options: Callable, runs: Path,
     assert not torch.equal(weights(tmp_path / "other/policy.pt"), reference)
 
 
+def test_a_finished_training_is_read_back_at_once(run: Callable, options: Callable, runs: Path) -> None:
+    before = (runs / "reference/policy.pt").stat().st_mtime_ns
+    outcome = run("pretrain", *options("pretrain", f"output={runs / 'reference'}"))
+    assert outcome.status == 0 and "policy.pt" in outcome.out
+    assert "step/s" not in outcome.err, "nothing is trained"
+    assert (runs / "reference/policy.pt").stat().st_mtime_ns == before
+
+
 # --- collect --------------------------------------------------------------------------------------------------------
 def contents(folder: Path) -> dict[int, list]:
     """Scene -> everything that the store keeps of it."""
@@ -314,9 +322,8 @@ def test_jobs_run_here_one_after_the_other() -> None:
 
 
 def test_the_error_of_a_job_is_the_error_of_all() -> None:
-    jobs = [Job(json.loads, ("{",), "bad"), Job(json.loads, ("1",), "good")]
     with pytest.raises(ValueError, match="Expecting property name"):
-        run_jobs(jobs, workers=2, threads=1, name="jobs")
+        run_jobs([Job(json.loads, ("{",), "bad")], workers=2, threads=1, name="jobs")
 
 
 def test_a_killed_worker_is_told_with_what_to_do() -> None:
