@@ -8,6 +8,7 @@ again to go on after a kill.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import hydra
@@ -21,7 +22,7 @@ from dpa.policy import MotionLM
 from dpa.preferences import PreferenceStore
 from dpa.report.figures import read_curves
 from dpa.training.batches import Item, ShuffledOrder, collate_items, micro_batches
-from dpa.training.optim import clip_and_step, make_optimizer, make_schedule
+from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
 from dpa.training.run import Run
 from dpa.training.seeding import make_generator, seed_everything
 from envs import keys
@@ -90,7 +91,8 @@ def align(
     with run:
         for step in run.steps():
             draw = make_generator(seed, "pairs", step)
-            losses = accumulate(loss, [candidates[i] for i in order(step)], options, draw, cfg.device)
+            groups = [candidates[i] for i in order(step)]
+            losses = accumulate_gradients(loss, parts_of(groups, options, draw, cfg.device))
             norm = clip_and_step(optimizer, options.max_norm, schedule)
             run.log({f"train/{key}": value for key, value in losses.items()} | {"train/gradient_norm": norm})
     write_policy(path, model, config, {"method": method.name, "seed": seed, "options": decided_by})
@@ -107,24 +109,14 @@ def make_loss(section: DictConfig, model: MotionLM) -> LossModule:
     return build(LOSSES[section.kind], DictConfig(options), f"method.loss ({section.kind})", token_network(model))
 
 
-def accumulate(
-    loss: LossModule, groups: list[Group], options: DictConfig, draw: torch.Generator, device: str
-) -> dict[str, torch.Tensor]:
-    """Gradients of the mean loss over scenes, part by part; returns each figure over all pairs of the step."""
+def parts_of(
+    groups: list[Group], options: DictConfig, draw: torch.Generator, device: str
+) -> Iterator[tuple[TensorDict, float]]:
+    """Drawn pairs (or targets) of scenes of similar size as batches, each with its share of the scenes."""
     chosen = [torch.randperm(len(group.preferred), generator=draw)[: options.pairs_per_scene] for group in groups]
     sizes = [group.token_valid.shape[0] * options.pairs_per_scene for group in groups]
-    means: dict[str, torch.Tensor] = {}
     for part in micro_batches(sizes, options.max_rows):
-        losses = loss(make_batch([(groups[i], chosen[i]) for i in part]).to(device))
-        share = len(part) / len(groups)
-        (share * sum(value for key, value in losses.items() if key.startswith("loss_"))).backward()
-        if "logit_std" in losses.keys():
-            losses["logit_square"] = losses["logit_std"] ** 2 + losses["logit_mean"] ** 2
-        for key, value in losses.items():
-            means[key] = means.get(key, 0) + share * value.detach()
-    if "logit_square" in means:  # the spread over all pairs, not the mean of the parts' spreads
-        means["logit_std"] = (means.pop("logit_square") - means["logit_mean"] ** 2).clamp(min=0).sqrt()
-    return means
+        yield make_batch([(groups[i], chosen[i]) for i in part]).to(device), len(part) / len(groups)
 
 
 def make_batch(chosen: list[tuple[Group, torch.Tensor]]) -> TensorDict:

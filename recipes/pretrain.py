@@ -9,16 +9,18 @@ The weights that are best on the tuning scenes become ``policy.pt``. Run the sam
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
 from pathlib import Path
 
 import hydra
 import torch
 from omegaconf import DictConfig
+from tensordict import TensorDict
 
 from dpa.losses import NextTokenLoss, token_network
 from dpa.policy import MotionLM, make_context
 from dpa.training.batches import Item, ShuffledOrder, collate_items, crop_agents, log_item, micro_batches
-from dpa.training.optim import clip_and_step, make_optimizer, make_schedule
+from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
 from dpa.training.run import Run
 from dpa.training.seeding import make_generator, seed_everything
 from envs import keys
@@ -72,7 +74,7 @@ def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path) -> Path:
         for step in run.steps():
             crop = make_generator(seed, "crop", step)
             items = [crop_agents(train[i], options.max_agents, crop) for i in order(step)]
-            losses = accumulate(loss, items, options.max_rows, cfg.device)
+            losses = accumulate_gradients(loss, parts_of(items, options.max_rows, cfg.device))
             norm = clip_and_step(optimizer, options.max_norm, schedule)
             run.log({f"train/{key}": value for key, value in losses.items()} | {"train/gradient_norm": norm})
             if (step + 1) % options.tune_interval == 0 or step + 1 == options.steps:
@@ -86,16 +88,10 @@ def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path) -> Path:
     return path
 
 
-def accumulate(loss: NextTokenLoss, items: list[Item], max_rows: int, device: str) -> dict[str, torch.Tensor]:
-    """Gradients of the mean loss over items, part by part; returns the mean of each figure."""
-    means: dict[str, torch.Tensor] = {}
+def parts_of(items: list[Item], max_rows: int, device: str) -> Iterator[tuple[TensorDict, float]]:
+    """Items of similar size as batches, each with its share of the items."""
     for part in micro_batches([item.tokens.shape[1] for item in items], max_rows):
-        losses = loss(collate_items([items[i] for i in part]).to(device))
-        share = len(part) / len(items)
-        (share * losses["loss_next_token"]).backward()
-        for key, value in losses.items():
-            means[key] = means.get(key, 0) + share * value.detach()
-    return means
+        yield collate_items([items[i] for i in part]).to(device), len(part) / len(items)
 
 
 def log_items(

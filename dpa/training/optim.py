@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable
 from typing import Literal
 
 import torch
-from torch import nn
+from tensordict import TensorDictBase
+from torch import Tensor, nn
 from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
@@ -90,6 +92,46 @@ def make_schedule(
         return left if shape == "linear" else 0.5 * (1 - math.cos(math.pi * left))
 
     return LambdaLR(optimizer, factor)
+
+
+def accumulate_gradients(
+    loss: Callable[[TensorDictBase], TensorDictBase], parts: Iterable[tuple[TensorDictBase, float]]
+) -> dict[str, Tensor]:
+    """Gradients of a loss over a batch that is passed in parts.
+
+    Args:
+        loss: gives ``loss_*`` entries, which are summed, and figures.
+        parts: each part with its share of the whole; shares sum to 1.
+
+    Returns:
+        Every entry over the whole batch, detached: means weighted by share; a figure ``x_std`` beside ``x_mean`` is the
+        spread over all parts together.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> weight = torch.ones((), requires_grad=True)
+        >>> def loss(batch):
+        ...     return TensorDict({"loss_x": weight * batch["x"].mean()})
+        >>> first, second = (TensorDict({"x": torch.tensor(x)}) for x in ([1.0, 3.0], [5.0]))
+        >>> accumulate_gradients(loss, [(first, 2 / 3), (second, 1 / 3)])["loss_x"], weight.grad
+        (tensor(3.), tensor(3.))
+    """
+    means: dict[str, Tensor] = {}
+    for batch, share in parts:
+        found = loss(batch)
+        (share * sum(value for key, value in found.items() if key.startswith("loss_"))).backward()
+        figures = {key: value.detach() for key, value in found.items()}
+        for key in _spreads(figures):
+            figures[key] = figures[key] ** 2 + figures[key.removesuffix("_std") + "_mean"] ** 2
+        for key, value in figures.items():
+            means[key] = means.get(key, 0) + share * value
+    for key in _spreads(means):
+        means[key] = (means[key] - means[key.removesuffix("_std") + "_mean"] ** 2).clamp(min=0).sqrt()
+    return means
+
+
+def _spreads(figures: dict[str, Tensor]) -> list[str]:
+    return [key for key in figures if key.endswith("_std") and key.removesuffix("_std") + "_mean" in figures]
 
 
 def clip_and_step(

@@ -17,12 +17,13 @@ from dpa.preferences import PreferenceStore
 from dpa.tokens import VerletTokenizer
 from dpa.training.checkpoint import load_policy
 from dpa.training.loggers import read_curve
+from dpa.training.optim import accumulate_gradients
 from envs import keys
 from envs.scene import CURRENT_STEP
 from envs.sources.synthetic import straight_road
 from envs.store import SceneStore
 from recipes import evaluate as evaluation
-from recipes.align import accumulate
+from recipes.align import parts_of
 from recipes.candidates import Group, pair_accuracy
 from recipes.evaluate import SCENE_FIGURES, standing_moved
 from recipes.models import open_policy
@@ -176,13 +177,10 @@ def test_a_step_is_the_same_however_it_is_split_into_parts() -> None:
         model = MotionLM("nano", tokenizer)
         loss = ContrastivePreferenceLoss(token_network(model))
         shake(model)  # away from the reference, where every pair has a gradient of its own
-        figures = accumulate(
-            loss,
-            [group_of(size) for size in (1, 3, 2)],
-            OmegaConf.create({"pairs_per_scene": 2, "max_rows": max_rows}),
-            torch.Generator().manual_seed(0),
-            "cpu",
-        )
+        groups = [group_of(size) for size in (1, 3, 2)]
+        options = OmegaConf.create({"pairs_per_scene": 2, "max_rows": max_rows})
+        draw = torch.Generator().manual_seed(0)
+        figures = accumulate_gradients(loss, parts_of(groups, options, draw, "cpu"))
         gradient = torch.cat([p.grad.flatten() for p in model.parameters() if p.grad is not None])
         parts.append((figures["loss_preference"], figures["logit_mean"], figures["logit_std"], gradient))
     for split in parts[:2]:
