@@ -28,7 +28,7 @@ from dpa.training.seeding import make_generator, seed_everything
 from envs import keys
 from envs.store import SceneStore
 from recipes.candidates import Group, make_candidates
-from recipes.cli import CONFIG, build, finished, plain, recipe, write_json
+from recipes.cli import CONFIG, build, finished, finite, plain, recipe, write_json
 from recipes.models import open_policy, weights_digest, write_policy
 from recipes.scenes import fingerprint, open_splits
 
@@ -70,7 +70,7 @@ def align(
         "reference": weights_digest(model),
         "preferences": store.provenance.policy,
     }
-    if finished(result, decided_by) is not None:
+    if finished(result, decided_by) is not None and path.is_file():
         return path
     seed_everything(seed)
     candidates = make_candidates(method.data, store, scenes, context, model.tokenizer.cpu(), seed)
@@ -96,7 +96,7 @@ def align(
             norm = clip_and_step(optimizer, options.max_norm, schedule)
             run.log({f"train/{key}": value for key, value in losses.items()} | {"train/gradient_norm": norm})
     write_policy(path, model, config, {"method": method.name, "seed": seed, "options": decided_by})
-    last = {name: curve["value"][-1] for name, curve in read_curves(folder).items()}
+    last = {name: finite(curve["value"][-1]) for name, curve in read_curves(folder).items()}
     write_json(result, {"options": decided_by, "policy": str(path), "last_step": last})
     return path
 
@@ -112,11 +112,16 @@ def make_loss(section: DictConfig, model: MotionLM) -> LossModule:
 def parts_of(
     groups: list[Group], options: DictConfig, draw: torch.Generator, device: str
 ) -> Iterator[tuple[TensorDict, float]]:
-    """Drawn pairs (or targets) of scenes of similar size as batches, each with its share of the scenes."""
+    """Drawn pairs (or targets) of scenes of similar size as batches, each with its share of the step.
+
+    A contrastive loss is a mean over pairs, of which each scene gives as many; imitation is a mean over tokens.
+    """
     chosen = [torch.randperm(len(group.preferred), generator=draw)[: options.pairs_per_scene] for group in groups]
     sizes = [group.token_valid.shape[0] * options.pairs_per_scene for group in groups]
+    weights = [1 if group.unpreferred is not None else int(group.token_valid.sum()) for group in groups]
     for part in micro_batches(sizes, options.max_rows):
-        yield make_batch([(groups[i], chosen[i]) for i in part]).to(device), len(part) / len(groups)
+        share = sum(weights[i] for i in part) / sum(weights)
+        yield make_batch([(groups[i], chosen[i]) for i in part]).to(device), share
 
 
 def make_batch(chosen: list[tuple[Group, torch.Tensor]]) -> TensorDict:

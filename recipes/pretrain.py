@@ -47,7 +47,7 @@ def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path) -> Path:
     path, result, options = folder / "policy.pt", folder / "result.json", cfg.pretraining
     config = policy_config(cfg.model)
     decided_by = {"policy": config, "pretraining": plain(options), "seed": seed, "scenes": fingerprint(splits.train)}
-    if finished(result, decided_by) is not None:
+    if finished(result, decided_by) is not None and path.is_file():
         return path
     seed_everything(seed)
     model = build_policy(config).to(cfg.device)
@@ -89,9 +89,11 @@ def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path) -> Path:
 
 
 def parts_of(items: list[Item], max_rows: int, device: str) -> Iterator[tuple[TensorDict, float]]:
-    """Items of similar size as batches, each with its share of the items."""
+    """Items of similar size as batches, each with its share of the valid tokens: the loss is a mean over tokens."""
+    tokens = [int(item.token_valid.sum()) for item in items]
     for part in micro_batches([item.tokens.shape[1] for item in items], max_rows):
-        yield collate_items([items[i] for i in part]).to(device), len(part) / len(items)
+        share = sum(tokens[i] for i in part) / sum(tokens)
+        yield collate_items([items[i] for i in part]).to(device), share
 
 
 def log_items(
