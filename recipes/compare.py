@@ -146,7 +146,8 @@ def compare(cfg: DictConfig) -> dict[str, Any]:
     every = [(seed, method) for method in methods for seed in seeds]
     stages.run("tune decoding", evaluate_job, [(*run, "tune", top_p) for run in every for top_p in cfg.decoding.grid])
     best = {method: choose_top_p(cfg, method) for method in methods}
-    wanted = {(*run, "eval", top_p) for run in every for top_p in {cfg.decoding.common, best[run[1]]}}
+    wanted = {(*run, "eval", top_p) for run in every for top_p in (cfg.decoding.common, best[run[1]])}
+    wanted |= {(seed, REFERENCE, "eval", top_p) for seed in seeds for top_p in cfg.decoding.grid}
     stages.run("evaluate", evaluate_job, sorted(wanted))
     stages.run("pair accuracy", accuracy_job, every)
     comparison = summarise_comparison(cfg, splits, best, stages.seconds, lambda *run: result_of(cfg, *run))

@@ -55,16 +55,16 @@ def summarise_comparison(
 ) -> dict[str, Any]:
     """The content of ``comparison.json``.
 
-    ``rows`` and ``paired`` compare at the common top-p, and show the reference at its own best one beside them: sharper
-    sampling alone can pass for alignment. ``own_best`` compares every method at its own best top-p with the reference
-    at its own.
+    ``rows`` and ``paired`` compare at the common top-p, and show the reference at the others of the grid beside them:
+    sharper sampling alone can pass for alignment. ``own_best`` compares every method at its own best top-p with the
+    reference at its own.
     """
     common, methods = cfg.decoding.common, [REFERENCE, *cfg.methods]
-    sharpest = [(REFERENCE, best[REFERENCE])] if best[REFERENCE] != common else []
+    others = [(REFERENCE, top_p) for top_p in cfg.decoding.grid if top_p != common]
     at_common, at_best = [(m, common) for m in methods], [(m, best[m]) for m in methods]
     results = {
         (method, top_p, seed): json.loads(result_of(seed, method, "eval", top_p).read_text(encoding="utf-8"))
-        for method, top_p in {*at_common, *at_best}
+        for method, top_p in {*at_common, *others, *at_best}
         for seed in cfg.seeds
     }
 
@@ -99,8 +99,8 @@ def summarise_comparison(
         "metric": cfg.evaluation.metric,
         "scenes": {**splits.sizes(), "source": cfg.scenes.source},
         "seeds": list(cfg.seeds),
-        "rows": rows(at_common + sharpest),
-        "paired": paired(at_common[1:] + sharpest, at_common[0]),
+        "rows": rows(at_common + others),
+        "paired": paired(at_common[1:] + others, at_common[0]),
         "own_best": {"rows": rows(at_best), "paired": paired(at_best[1:], at_best[0])},
         "per_scene": {
             method: {str(seed): results[method, common, seed]["per_scene"]["realism"] for seed in cfg.seeds}
