@@ -34,6 +34,7 @@ from envs.workers import run_tasks
 SHARD_SIZE = 256
 """Scenes in a shard. Each worker holds one shard in memory while it makes it (about 0.2 GB for WOMD)."""
 BAD_INPUT_STATUS = 2
+INTERRUPTED_STATUS = 130
 """Exit status after an error in the inputs or the store."""
 
 
@@ -309,6 +310,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ValueError as error:
         sys.stderr.write(f"error: {error}\n")
         return BAD_INPUT_STATUS
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted; run the same command again to go on\n")
+        return INTERRUPTED_STATUS
     return 0
 
 

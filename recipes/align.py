@@ -28,7 +28,7 @@ from dpa.training.seeding import make_generator, seed_everything
 from envs import keys
 from envs.store import SceneStore
 from recipes.candidates import Group, make_candidates
-from recipes.cli import CONFIG, build, finished, finite, plain, recipe, write_json
+from recipes.cli import CONFIG, build, check_steps, finished, finite, plain, recipe, write_json
 from recipes.models import open_policy, weights_digest, write_policy
 from recipes.scenes import fingerprint, open_splits
 
@@ -141,6 +141,7 @@ def make_batch(chosen: list[tuple[Group, torch.Tensor]]) -> TensorDict:
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.align``."""
+    check_steps(cfg.alignment, "alignment")
     scenes = open_splits(cfg.scenes).train
     path = align(cfg, cfg.method, scenes, Path(cfg.policy), Path(cfg.preferences), cfg.seed, Path(cfg.output))
     print(f"policy: {path}")

@@ -65,6 +65,12 @@ def make_candidates(
         raise ValueError(f"method.data.kind must be one of {', '.join(DATA)}, got {data.kind!r}.")
     if data.kind != "adversarial" and data.rank_by not in (keys.DISTANCE, keys.ADE):
         raise ValueError(f"method.data.rank_by must be distance or ade, got {data.rank_by!r}.")
+    needed, held = data.num * (2 if data.kind == "pairs" else 1), store.provenance.num_rollouts
+    if not data.num > 0 or needed > held:
+        raise ValueError(
+            f"method.data.num={data.num} needs {needed} rollouts of a scene and the store holds {held}; lower it, or "
+            "collect again with a larger collection.num_rollouts."
+        )
     contexts = Contexts(scenes, options)
     groups = []
     for row, scene in enumerate(store.scenes.tolist()):

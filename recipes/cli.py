@@ -16,8 +16,11 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from dpa.training.options import differences
+
 CONFIG = {"version_base": "1.3", "config_path": str(Path(__file__).parent / "config")}
 """Arguments of ``hydra.main`` that all recipes share; with an absolute path, ``main`` may also be imported."""
+INTERRUPTED_STATUS = 130
 USER_ERRORS = (ValueError, OSError, ImportError, FloatingPointError, HydraException, OmegaConfBaseException)
 
 
@@ -27,14 +30,54 @@ def recipe(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
     @functools.wraps(main)
     def run(cfg: DictConfig) -> None:
         warnings.filterwarnings("ignore", category=DeprecationWarning, module="torchrl")
-        torch.set_num_threads(cfg.threads)
         try:
+            check_resources(cfg)
             main(cfg)
         except USER_ERRORS as error:
             print(f"error: {error}", file=sys.stderr)
             sys.exit(2)
+        except KeyboardInterrupt:
+            sys.exit(interrupted())
+        except RuntimeError as error:
+            # tensordict hides an interrupt that comes while it has swapped a module's parameters.
+            if not isinstance(error.__context__, KeyboardInterrupt):
+                raise
+            sys.exit(interrupted())
 
     return run
+
+
+def interrupted() -> int:
+    """Say how to go on after Ctrl-C; returns the exit status that shells expect."""
+    print("interrupted; run the same command again to go on", file=sys.stderr)
+    return INTERRUPTED_STATUS
+
+
+def check_resources(cfg: DictConfig) -> None:
+    """Set torch's threads and refuse a device that is not there, before any work.
+
+    Raises:
+        ValueError: no such device.
+    """
+    torch.set_num_threads(cfg.threads)
+    if torch.device(cfg.device).type == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"device={cfg.device}: torch {torch.__version__} finds no GPU here; say device=cpu.")
+
+
+def check_steps(section: DictConfig, name: str) -> None:
+    """Refuse a number of steps that cannot be trained, before any work.
+
+    Raises:
+        ValueError: steps or warm-up are no whole numbers, or the warm-up does not end within the steps.
+    """
+    for key in ("steps", "warmup"):
+        if not isinstance(section[key], int):
+            raise ValueError(f"{name}.{key} must be a whole number, got {section[key]!r}.")
+    if not 0 <= section.warmup < section.steps:
+        raise ValueError(
+            f"{name}.warmup must be less than {name}.steps, got {section.warmup} and {section.steps}; say for example "
+            f"{name}.warmup={section.steps // 10}."
+        )
 
 
 def plain(section: DictConfig) -> dict[str, Any]:
@@ -92,10 +135,7 @@ def finished(path: Path, decided_by: dict[str, Any]) -> dict[str, Any] | None:
         options = content["options"]
     except (ValueError, LookupError, TypeError) as error:
         raise ValueError(f"{path} is no result of this recipe ({error}); remove it, or name another file.") from None
-    now = json.loads(json.dumps(decided_by))
-    if options != now:
-        differ = sorted(k for k in now | options if now.get(k) != options.get(k))
-        raise ValueError(
-            f"{path} was written with other options ({', '.join(differ)}); name another output folder, or remove it."
-        )
+    differ = differences(options, decided_by)
+    if differ:
+        raise ValueError(f"{path} was written with other options ({differ}); name another output folder, or remove it.")
     return content

@@ -9,6 +9,7 @@ decoding on the tuning scenes, and evaluate once. Run the same command again to 
 
 from __future__ import annotations
 
+import json
 import sys
 import time
 from collections.abc import Callable
@@ -18,10 +19,11 @@ from typing import Any
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
+from dpa.preferences import PreferenceStore
 from dpa.report.table import print_table
 from recipes.align import align
 from recipes.candidates import make_candidates, pair_accuracy
-from recipes.cli import CONFIG, finished, plain, recipe, write_json
+from recipes.cli import CONFIG, check_steps, finished, plain, recipe, write_json
 from recipes.collect import collect
 from recipes.evaluate import evaluate
 from recipes.models import open_policy, policy_config, weights_digest
@@ -71,8 +73,6 @@ def accuracy_job(cfg: DictConfig, seed: int, method: str) -> None:
     decided_by = {"policy": weights_digest(model), "data": plain(data), "seed": seed}
     if finished(path, decided_by) is None:
         scenes = open_splits(cfg.scenes).eval
-        from dpa.preferences import PreferenceStore
-
         store = PreferenceStore(preferences_of(cfg, seed, "eval"))
         pairs = make_candidates(data, store, scenes, context, model.tokenizer, seed)
         write_json(path, {"options": decided_by, "pair_accuracy": pair_accuracy(model, pairs, cfg.device)})
@@ -111,43 +111,55 @@ def choose_top_p(cfg: DictConfig, method: str) -> float:
 
 def finished_figures(path: Path) -> dict[str, Any]:
     """A result that a job of this run has written."""
-    import json
-
     return json.loads(path.read_text(encoding="utf-8"))
 
 
 class Stages:
-    """Runs the stages one after the other and keeps how long each took, over all calls of the recipe."""
+    """Runs the stages one after the other and keeps how long each took, over all calls until it was complete."""
 
     def __init__(self, cfg: DictConfig) -> None:
         self.cfg, self.path = cfg, Path(cfg.output) / "stages.json"
-        self.seconds: dict[str, float] = finished_figures(self.path) if self.path.is_file() else {}
+        self.kept: dict[str, dict[str, Any]] = finished_figures(self.path) if self.path.is_file() else {}
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Seconds of each stage."""
+        return {name: entry["seconds"] for name, entry in self.kept.items()}
 
     def run(self, name: str, job: Callable[..., None], arguments: list[tuple]) -> None:
-        """Run one job for each tuple of arguments."""
+        """Run one job for each tuple of arguments; reading a complete stage back costs nothing in the account."""
+        entry = self.kept.setdefault(name, {"seconds": 0.0, "jobs": 0})
         start = time.perf_counter()
         jobs = [Job(job, (self.cfg, *each), " ".join(map(str, (name, *each)))) for each in arguments]
+        complete, left = entry["jobs"] == len(jobs), len(jobs)
         try:
             run_jobs(jobs, self.cfg.workers, self.cfg.threads, name)
+            left = 0
         finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
-            write_json(self.path, self.seconds)
+            if not complete:
+                entry["seconds"] += time.perf_counter() - start
+            entry["jobs"] = len(jobs) - left
+            write_json(self.path, self.kept)
 
 
 def compare(cfg: DictConfig) -> dict[str, Any]:
     """Run every stage that is not done yet and write the report; returns the content of ``comparison.json``."""
     seeds, methods = list(cfg.seeds), [REFERENCE, *cfg.methods]
+    for section in ("pretraining", "alignment"):  # a wrong option is told before hours of work
+        check_steps(cfg[section], section)
+    policy_config(cfg.model)
     stages = Stages(cfg)
     splits = open_splits(cfg.scenes)
-    policy_config(cfg.model)  # a wrong option is told before hours of work
     stages.run("pretrain", pretrain_job, [(seed,) for seed in seeds])
     stages.run("collect", collect_job, [(seed, split) for seed in seeds for split in ("train", "eval")])
     stages.run("align", align_job, [(seed, method) for seed in seeds for method in cfg.methods])
     every = [(seed, method) for method in methods for seed in seeds]
-    stages.run("tune decoding", evaluate_job, [(*run, "tune", top_p) for run in every for top_p in cfg.decoding.grid])
-    best = {method: choose_top_p(cfg, method) for method in methods}
+    grid = list(cfg.decoding.grid)
+    if len(grid) > 1:  # otherwise there is nothing to choose
+        stages.run("tune decoding", evaluate_job, [(*run, "tune", top_p) for run in every for top_p in grid])
+    best = {method: choose_top_p(cfg, method) if len(grid) > 1 else grid[0] for method in methods}
     wanted = {(*run, "eval", top_p) for run in every for top_p in (cfg.decoding.common, best[run[1]])}
-    wanted |= {(seed, REFERENCE, "eval", top_p) for seed in seeds for top_p in cfg.decoding.grid}
+    wanted |= {(seed, REFERENCE, "eval", top_p) for seed in seeds for top_p in grid}
     stages.run("evaluate", evaluate_job, sorted(wanted))
     stages.run("pair accuracy", accuracy_job, every)
     comparison = summarise_comparison(cfg, splits, best, stages.seconds, lambda *run: result_of(cfg, *run))

@@ -27,7 +27,7 @@ from envs import keys
 from envs.augment import mirror
 from envs.progress import progress
 from envs.scene import SceneSource
-from recipes.cli import CONFIG, finished, plain, recipe, write_json
+from recipes.cli import CONFIG, check_steps, finished, plain, recipe, write_json
 from recipes.models import build_policy, context_options, policy_config, write_policy
 from recipes.scenes import Splits, fingerprint, open_splits
 
@@ -142,6 +142,7 @@ def negative_log_likelihood(model: MotionLM, items: list[Item], max_agents: int,
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.pretrain``."""
+    check_steps(cfg.pretraining, "pretraining")
     path = pretrain(cfg, open_splits(cfg.scenes), cfg.seed, Path(cfg.output))
     print(f"policy: {path}")
 

@@ -52,7 +52,10 @@ def open_splits(cfg: DictConfig) -> Splits:
     if shared:
         raise ValueError(f"scenes.train and scenes.eval share {len(shared)} scenes (the first is {shared[0]!r}).")
     if not 0 < cfg.tune < len(pool):
-        raise ValueError(f"scenes.tune must lie between 1 and the {len(pool) - 1} training scenes, got {cfg.tune}.")
+        raise ValueError(
+            f"scenes.tune, taken from the {len(pool)} scenes of scenes.train, must leave some to train on, got "
+            f"{cfg.tune}; say for example scenes.tune={max(1, len(pool) // 5)}."
+        )
     order = torch.randperm(len(pool), generator=make_generator(cfg.split_seed, "tune")).tolist()
     tune, train = sorted(order[: cfg.tune]), sorted(order[cfg.tune :])
     if cfg.limit is not None:

@@ -23,7 +23,6 @@ Examples:
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import random
@@ -38,6 +37,8 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from torch import Tensor, nn
+
+from dpa.training.options import differences
 
 FORMAT = "dpa-omf/1"
 """First entry of every file; the number changes when old files can no longer be read."""
@@ -301,15 +302,11 @@ def load_weights(
 
 
 def _check_same_config(where: object, saved: Mapping[str, Any] | None, config: Mapping[str, Any]) -> None:
-    # A tuple comes back from YAML or JSON as a list; that is no difference.
-    saved, config = (json.loads(json.dumps(dict(entries))) for entries in (saved or {}, config))
-    names = [name for name in {**saved, **config} if saved.get(name) != config.get(name)]
-    if names:
-        theirs = {name: saved[name] for name in names if name in saved}
-        ours = {name: config[name] for name in names if name in config}
+    differ = differences(saved or {}, config)
+    if differ:
         raise ValueError(
-            f"{where} was saved by a model with the configuration {theirs}, this model has {ours}. Build the model "
-            "from the saved configuration, or use another folder or file."
+            f"{where} was saved by a model with another configuration ({differ}). Build the model from the saved "
+            "configuration, or use another folder or file."
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -9,7 +10,20 @@ from typing import Any, Literal
 
 from dpa.training.checkpoint import Checkpointer, Stateful, capture, restore
 from dpa.training.loggers import Backend, make_logger
+from dpa.training.options import differences
 from envs.progress import progress
+
+
+def _refuse_other_options(folder: Path, config: Mapping[str, Any]) -> None:
+    """A run that was killed before its first checkpoint is a run too: its folder is not for other options."""
+    written = folder / "config.json"
+    if not written.is_file():
+        return
+    differ = differences(json.loads(written.read_text(encoding="utf-8")), config)
+    if differ:
+        raise ValueError(
+            f"{folder} holds a run with other options ({differ}); name another output folder, or remove it."
+        )
 
 
 class Run:
@@ -60,6 +74,7 @@ class Run:
         self.state: dict[str, Any] = {}
         """Plain values that are kept in every checkpoint, for the recipe's own use."""
         self._checkpoints = Checkpointer(self.folder / "checkpoints", config=config)
+        _refuse_other_options(self.folder, config)
         saved = self._checkpoints.latest()
         if saved is not None:
             restore(saved, parts)

@@ -27,6 +27,10 @@ def main(arguments: list[str] | None = None) -> None:
         scene = store[_scene_index(store, chosen.scene)]
     except SceneError as error:
         parser.error(str(error))
+    if chosen.out.suffix.lower() not in (".png", ".gif"):
+        parser.error(f"--out must end in .png or .gif, got {chosen.out}")
+    if not 0 <= chosen.step < LOG_STEPS:
+        parser.error(f"--step must lie in 0 to {LOG_STEPS - 1}, got {chosen.step}")
     view = fit_view(scene)
     if chosen.radius is not None:
         if not math.isfinite(chosen.radius) or chosen.radius <= 0:

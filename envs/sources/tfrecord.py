@@ -60,6 +60,8 @@ def offsets(path: str) -> Iterator[int]:
     with open_binary(path) as file:
         # Seeking beyond the end is no error, so a cut last payload shows only against the size of the file.
         size = _size(file, path)
+        if size == 0:
+            raise SceneError(f"{path}: the file is empty; fetch it again.")
         position, record = 0, 0
         while position < size:
             file.seek(position)

@@ -104,9 +104,15 @@ def test_a_run_does_not_go_on_with_a_policy_of_another_size(
 ) -> None:
     shutil.copytree(runs / "reference", tmp_path / "reference")
     command = options("pretrain", f"output={tmp_path / 'reference'}", "pretraining.steps=2", "model=small")
-    assert_refused(run("pretrain", *command), "result.json was written with other options (policy)")
+    assert_refused(
+        run("pretrain", *command),
+        "result.json was written with other options",
+        "'policy.model.width': 48 there, 64 here",
+    )
     (tmp_path / "reference/result.json").unlink()  # as if the run had not finished
-    assert_refused(run("pretrain", *command), "'width': 48", "'width': 64")
+    assert_refused(
+        run("pretrain", *command), "holds a run with other options", "'policy.model.width': 48 there, 64 here"
+    )
 
 
 def test_preferences_of_other_scenes_are_refused(
@@ -147,7 +153,7 @@ def test_rollouts_of_two_policies_do_not_go_into_one_store(run: Callable, option
         ("method.data.rank_by=taste", ("method.data.rank_by must be distance or ade", "taste")),
         ("+method.loss.beta=1", ("method.loss (contrastive) has no option 'beta'", "alpha")),
         ("method.loss.alpha=-1", ("alpha must be positive, got -1",)),
-        ("alignment.warmup=9", ("warmup_steps must lie in [0, total_steps), got 9 of 4",)),
+        ("alignment.warmup=9", ("alignment.warmup must be less than alignment.steps, got 9 and 4",)),
         ("method.data.num=3", ("3",)),
     ],
 )
@@ -168,7 +174,13 @@ def test_options_that_make_no_sense_are_refused(
 @pytest.mark.parametrize(
     ("option", "words"),
     [
-        ("scenes.tune=8", ("scenes.tune must lie between 1 and the 7 training scenes, got 8",)),
+        (
+            "scenes.tune=8",
+            (
+                "scenes.tune, taken from the 8 scenes of scenes.train, must leave some",
+                "got 8",
+            ),
+        ),
         ("scenes.source=wmod", ("wmod",)),
         ("model.size=huge", ("model.size must be one of", "huge")),
         ("model.tokenizer.name=patches", ("model.tokenizer.name must be one of", "patches")),
@@ -212,7 +224,7 @@ def test_a_result_of_the_same_options_is_read_back_and_others_are_refused(tmp_pa
     assert finished(path, {"seed": 0}) is None
     write_json(path, {"options": {"seed": 0, "grid": [1, 2]}, "value": 3.0})
     assert finished(path, {"seed": 0, "grid": (1, 2)})["value"] == 3.0
-    with pytest.raises(ValueError, match=r"other options \(seed\); name another output folder"):
+    with pytest.raises(ValueError, match=r"other options \('seed': 0 there, 1 here\); name another output"):
         finished(path, {"seed": 1, "grid": (1, 2)})
 
 
