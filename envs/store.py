@@ -155,6 +155,16 @@ class SceneStore:
             raise SceneError(f"{self.folder}: no scene {scene_id!r} among its {len(self)}; see scene_ids.")
         return self._index[scene_id]
 
+    def find(self, name: str) -> int:
+        """Index of a scene that is given by its id or by its index as text; ids come first, as they may be all digits.
+
+        Raises:
+            SceneError: the store has no such scene.
+        """
+        if name not in self._index and name.isdecimal() and int(name) < len(self):
+            return int(name)
+        return self.index_of(name)
+
     def subset(self, indices: Sequence[int]) -> SceneStore:
         """A view of some scenes, in the order given, that shares this store's files.
 

@@ -14,13 +14,13 @@ from typing import Any
 import torch
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from dpa.training.options import differences
 
 CONFIG = {"version_base": "1.3", "config_path": str(Path(__file__).parent / "config")}
 """Arguments of ``hydra.main`` that all recipes share; with an absolute path, ``main`` may also be imported."""
-INTERRUPTED_STATUS = 130
+REFUSED_STATUS, INTERRUPTED_STATUS = 2, 130
 USER_ERRORS = (ValueError, OSError, ImportError, FloatingPointError, HydraException, OmegaConfBaseException)
 
 
@@ -33,9 +33,10 @@ def recipe(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
         try:
             check_resources(cfg)
             main(cfg)
+        except MissingMandatoryValue as error:
+            sys.exit(refused(f"{error.full_key} is not given; say {error.full_key}=VALUE (--help says more)."))
         except USER_ERRORS as error:
-            print(f"error: {error}", file=sys.stderr)
-            sys.exit(2)
+            sys.exit(refused(error))
         except KeyboardInterrupt:
             sys.exit(interrupted())
         except RuntimeError as error:
@@ -45,6 +46,12 @@ def recipe(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
             sys.exit(interrupted())
 
     return run
+
+
+def refused(error: object) -> int:
+    """Say what a user can mend; returns the exit status."""
+    print(f"error: {error}", file=sys.stderr)
+    return REFUSED_STATUS
 
 
 def interrupted() -> int:

@@ -27,7 +27,7 @@ from recipes.cli import CONFIG, check_steps, finished, plain, recipe, write_json
 from recipes.collect import collect
 from recipes.evaluate import evaluate
 from recipes.models import open_policy, policy_config, weights_digest
-from recipes.pool import Job, run_jobs
+from recipes.pool import Job, Workers
 from recipes.pretrain import pretrain
 from recipes.scenes import open_splits
 from recipes.summary import REFERENCE, summarise_comparison, write_report
@@ -117,8 +117,8 @@ def finished_figures(path: Path) -> dict[str, Any]:
 class Stages:
     """Runs the stages one after the other and keeps how long each took, over all calls until it was complete."""
 
-    def __init__(self, cfg: DictConfig) -> None:
-        self.cfg, self.path = cfg, Path(cfg.output) / "stages.json"
+    def __init__(self, cfg: DictConfig, workers: Workers) -> None:
+        self.cfg, self.workers, self.path = cfg, workers, Path(cfg.output) / "stages.json"
         self.kept: dict[str, dict[str, Any]] = finished_figures(self.path) if self.path.is_file() else {}
 
     @property
@@ -133,7 +133,7 @@ class Stages:
         jobs = [Job(job, (self.cfg, *each), " ".join(map(str, (name, *each)))) for each in arguments]
         complete, left = entry["jobs"] == len(jobs), len(jobs)
         try:
-            run_jobs(jobs, self.cfg.workers, self.cfg.threads, name)
+            self.workers.run(jobs, name)
             left = 0
         finally:
             if not complete:
@@ -144,27 +144,34 @@ class Stages:
 
 def compare(cfg: DictConfig) -> dict[str, Any]:
     """Run every stage that is not done yet and write the report; returns the content of ``comparison.json``."""
-    seeds, methods = list(cfg.seeds), [REFERENCE, *cfg.methods]
     for section in ("pretraining", "alignment"):  # a wrong option is told before hours of work
         check_steps(cfg[section], section)
     policy_config(cfg.model)
-    stages = Stages(cfg)
     splits = open_splits(cfg.scenes)
+    with Workers(cfg.workers, cfg.threads) as workers:
+        stages = Stages(cfg, workers)
+        best = run_stages(cfg, stages)
+    comparison = summarise_comparison(cfg, splits, best, stages.seconds, lambda *run: result_of(cfg, *run))
+    write_report(cfg, splits, comparison)
+    return comparison
+
+
+def run_stages(cfg: DictConfig, stages: Stages) -> dict[str, float]:
+    """From pre-training to the figures of every policy; returns each method's own best top-p."""
+    seeds, methods, grid = list(cfg.seeds), [REFERENCE, *cfg.methods], list(cfg.decoding.grid)
     stages.run("pretrain", pretrain_job, [(seed,) for seed in seeds])
     stages.run("collect", collect_job, [(seed, split) for seed in seeds for split in ("train", "eval")])
     stages.run("align", align_job, [(seed, method) for seed in seeds for method in cfg.methods])
     every = [(seed, method) for method in methods for seed in seeds]
-    grid = list(cfg.decoding.grid)
+    best = dict.fromkeys(methods, grid[0])
     if len(grid) > 1:  # otherwise there is nothing to choose
         stages.run("tune decoding", evaluate_job, [(*run, "tune", top_p) for run in every for top_p in grid])
-    best = {method: choose_top_p(cfg, method) if len(grid) > 1 else grid[0] for method in methods}
+        best = {method: choose_top_p(cfg, method) for method in methods}
     wanted = {(*run, "eval", top_p) for run in every for top_p in (cfg.decoding.common, best[run[1]])}
     wanted |= {(seed, REFERENCE, "eval", top_p) for seed in seeds for top_p in grid}
     stages.run("evaluate", evaluate_job, sorted(wanted))
     stages.run("pair accuracy", accuracy_job, every)
-    comparison = summarise_comparison(cfg, splits, best, stages.seconds, lambda *run: result_of(cfg, *run))
-    write_report(cfg, splits, comparison)
-    return comparison
+    return best
 
 
 @hydra.main(**CONFIG, config_name="compare")

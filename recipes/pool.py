@@ -28,45 +28,61 @@ class Job(NamedTuple):
     name: str
 
 
-def run_jobs(jobs: list[Job], workers: int, threads: int, name: str) -> None:
-    """Run jobs, ``workers`` at a time.
+class Workers:
+    """Worker processes that live as long as the block, so that each imports torch once for many lots of jobs.
 
     Args:
-        jobs: in the order in which they start.
-        workers: processes; with 1 the jobs run in this one.
+        count: processes; with 1 the jobs run in this one.
         threads: of torch in each worker.
-        name: of the progress bar.
 
     Raises:
-        ChildProcessError: a worker was killed.
-        Exception: the first error of a job; jobs that have not started are dropped.
+        ValueError: no worker.
     """
-    if workers < 1:
-        raise ValueError(f"workers must be 1 or more, got {workers}.")
-    if workers == 1:
-        for job in progress(jobs, name, unit="job"):
-            _work(job, threads)
-        return
-    # Forking a process that has run torch threads can hang, so workers start fresh.
-    context = multiprocessing.get_context("spawn")
-    started, lock = context.Value("i", 0), context.RLock()
-    use_line(0, lock)
-    with (
-        progress(total=len(jobs), description=name, unit="job") as bar,
-        ProcessPoolExecutor(workers, context, _start, (lock, started)) as pool,
-    ):
-        futures = [pool.submit(_work, job, threads) for job in jobs]
+
+    def __init__(self, count: int, threads: int) -> None:
+        if count < 1:
+            raise ValueError(f"workers must be 1 or more, got {count}.")
+        self.count, self.threads = count, threads
+        self._pool: ProcessPoolExecutor | None = None
+
+    def __enter__(self) -> Workers:
+        if self.count > 1:
+            # Forking a process that has run torch threads can hang, so workers start fresh.
+            context = multiprocessing.get_context("spawn")
+            started, lock = context.Value("i", 0), context.RLock()
+            use_line(0, lock)
+            self._pool = ProcessPoolExecutor(self.count, context, _start, (lock, started))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+    def run(self, jobs: list[Job], name: str) -> None:
+        """Run jobs, as many at a time as there are workers.
+
+        Args:
+            jobs: in the order in which they start.
+            name: of the progress bar.
+
+        Raises:
+            ChildProcessError: a worker was killed.
+            Exception: the first error of a job; jobs that have not started are dropped.
+        """
+        if self._pool is None:
+            for job in progress(jobs, name, unit="job"):
+                _work(job, self.threads)
+            return
+        futures = [self._pool.submit(_work, job, self.threads) for job in jobs]
         try:
-            for future in as_completed(futures):
-                future.result()
-                bar.update()
+            with progress(total=len(jobs), description=name, unit="job") as bar:
+                for future in as_completed(futures):
+                    future.result()
+                    bar.update()
         except BrokenProcessPool as error:
             raise ChildProcessError(
                 f"a worker of {name!r} was killed, perhaps for want of memory; run it again with workers=1."
             ) from error
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
 
 
 def _start(lock: Any, started: Any) -> None:

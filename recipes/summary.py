@@ -13,13 +13,11 @@ from omegaconf import DictConfig
 
 from dpa.report.figures import plot_comparison, plot_curves, plot_scenes, read_curves
 from dpa.report.page import Picture, write_page
-from dpa.report.player import PlayerScene
 from dpa.report.statistics import compare_methods
 from dpa.report.table import REFERENCE
-from dpa.rollout import Decoding, collect_groups, simulated_poses
-from envs import keys
+from dpa.rollout import Decoding
 from recipes.cli import plain, write_json
-from recipes.models import open_policy
+from recipes.play import roll_out
 from recipes.scenes import Splits
 
 FIGURES = (
@@ -42,7 +40,6 @@ CURVES = (
     "train/entropy",
 )
 """Scalars that are drawn (METHOD figures 4 and 6)."""
-PLAYED_ROLLOUTS = 4
 PACKAGES = ("torch", "torchrl", "tensordict", "pot", "numpy", "dpa-omf")
 
 
@@ -129,7 +126,14 @@ def write_report(cfg: DictConfig, splits: Splits, comparison: dict[str, Any]) ->
         {REFERENCE: {k: v for k, v in reference.items() if k.startswith(("train/loss", "tune/"))}},
         folder / "pretraining.png",
     )
-    players = play(cfg, splits, seed)
+    players = roll_out(
+        {name: folder / f"seed_{seed}" / name / "policy.pt" for name in (REFERENCE, *cfg.methods)},
+        splits.eval,
+        range(min(cfg.pictures, len(splits.eval))),
+        decoding=Decoding(cfg.decoding.common, cfg.evaluation.temperature),
+        seed=seed,
+        device=cfg.device,
+    )
     plot_scenes(
         [player.scene for player in players],
         {method: [player.rollouts[method] for player in players] for method in players[0].rollouts},
@@ -153,31 +157,6 @@ def write_report(cfg: DictConfig, splits: Splits, comparison: dict[str, Any]) ->
         config=plain(cfg),
         method="dpa_omf" if "dpa_omf" in cfg.methods else None,
     )
-
-
-def play(cfg: DictConfig, splits: Splits, seed: int) -> list[PlayerScene]:
-    """A few evaluation scenes with rollouts of every method at the common top-p."""
-    wanted = list(range(min(cfg.pictures, len(splits.eval))))
-    rollouts: dict[int, dict[str, Any]] = {index: {} for index in wanted}
-    for method in (REFERENCE, *cfg.methods):
-        model, context, _ = open_policy(Path(cfg.output) / f"seed_{seed}" / method / "policy.pt", cfg.device)
-        decoding = Decoding(cfg.decoding.common, cfg.evaluation.temperature)
-        batches = collect_groups(
-            splits.eval,
-            model,
-            wanted,
-            num_rollouts=PLAYED_ROLLOUTS,
-            decoding=decoding,
-            options=context,
-            seed=seed,
-            device=cfg.device,
-        )
-        for batch in batches:
-            poses = simulated_poses(batch, PLAYED_ROLLOUTS).cpu()
-            for row, index in enumerate(batch[keys.SCENE][::PLAYED_ROLLOUTS, 0].tolist()):
-                present = int(splits.eval[index].agents.present.sum())
-                rollouts[index][method] = poses[row, :, :present]
-    return [PlayerScene(splits.eval[index], rollouts[index]) for index in wanted]
 
 
 def _pair_accuracy(folder: Path) -> float:

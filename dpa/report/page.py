@@ -79,7 +79,6 @@ def write_page(
         raise ValueError(f"the comparison has no {', '.join(missing)}; a page needs {', '.join(REQUIRED)}.")
     records = summarise(comparison["rows"], comparison["paired"])
     parts = {
-        "title": escape(title),
         "headline": escape(headline(comparison, method)),
         "reservations": "\n".join(f"<li>{escape(note)}</li>" for note in reservations(comparison, method)),
         "table_header": "".join(map(_table_title, header(records))),
@@ -89,10 +88,36 @@ def write_page(
         "facts": "\n".join(f"<dt>{escape(name)}</dt><dd>{value}</dd>" for name, value in _facts(comparison)),
         "config": escape(json.dumps(config, indent=2, ensure_ascii=False, allow_nan=False)),
     }
-    path = Path(folder) / "index.html"
+    return _write(Path(folder) / "index.html", title, _filled("comparison.html", parts))
+
+
+def write_rollouts(
+    path: str | Path, players: Sequence[PlayerScene], facts: Mapping[str, str], *, title: str = "Rollouts"
+) -> Path:
+    """Write a page that plays scenes and nothing else; it appears whole or not at all.
+
+    Args:
+        path: of the page, ``.html``.
+        players: scenes to play.
+        facts: name -> value of what made them, shown below.
+        title: of the page.
+
+    Returns:
+        Path of the page.
+
+    Raises:
+        ValueError: no scene, or rollouts do not fit.
+    """
+    if not players:
+        raise ValueError("a page of rollouts needs at least one scene.")
+    shown = "\n".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in facts.items())
+    return _write(Path(path), title, _filled("rollouts.html", {"player": _player(players), "facts": shown}))
+
+
+def _write(path: Path, title: str, body: str) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name("index.html.part")
-    part.write_text(_filled("page.html", parts), encoding="utf-8")
+    part = path.with_name(f"{path.name}.part")
+    part.write_text(_filled("page.html", {"title": escape(title), "body": body}), encoding="utf-8")
     os.replace(part, path)
     return path
 

@@ -138,24 +138,19 @@ def clip_and_step(
     optimizer: Optimizer,
     max_norm: float,
     schedule: LambdaLR | None = None,
-    on_nonfinite: Literal["raise", "skip"] = "raise",
 ) -> float:
     """Clip the gradients, update the parameters, advance the schedule and clear the gradients.
-
-    A skipped update leaves the schedule where it is: the schedule counts the updates that were made.
 
     Args:
         optimizer: holds the parameters.
         max_norm: bound on the norm of all gradients together.
         schedule: what :func:`make_schedule` returned.
-        on_nonfinite: what to do when the norm is infinite or not a number: stop, or leave the parameters as they are.
 
     Returns:
-        The norm before clipping; not finite if the update was skipped.
+        The norm before clipping.
 
     Raises:
-        FloatingPointError: the norm is not finite and ``on_nonfinite`` is ``"raise"``; the parameters are unchanged.
-        ValueError: another ``on_nonfinite``.
+        FloatingPointError: the norm is infinite or not a number; the parameters are unchanged.
 
     Examples:
         >>> net = nn.Linear(1, 1, bias=False)
@@ -164,18 +159,15 @@ def clip_and_step(
         >>> clip_and_step(optimizer, max_norm=1.0)
         3.0
     """
-    if on_nonfinite not in ("raise", "skip"):
-        raise ValueError(f"on_nonfinite must be 'raise' or 'skip', got {on_nonfinite!r}.")
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     norm = torch.nn.utils.clip_grad_norm_(parameters, max_norm).item()
-    if math.isfinite(norm):
-        optimizer.step()
-        if schedule is not None:
-            schedule.step()
-    elif on_nonfinite == "raise":
+    if not math.isfinite(norm):
         raise FloatingPointError(
-            f"the gradient norm is {norm}; the parameters are unchanged. Lower the learning rate, look for an input "
-            "that is not finite, or pass on_nonfinite='skip'."
+            f"the gradient norm is {norm}; the parameters are unchanged. Lower the learning rate, or look for an input "
+            "that is not finite."
         )
+    optimizer.step()
+    if schedule is not None:
+        schedule.step()
     optimizer.zero_grad(set_to_none=True)
     return norm

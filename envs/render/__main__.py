@@ -6,6 +6,7 @@ import argparse
 import math
 from pathlib import Path
 
+from envs.progress import progress
 from envs.render.layers import fit_view
 from envs.render.picture import render_frames, save_picture
 from envs.scene import CURRENT_STEP, LOG_STEPS, SceneError
@@ -24,7 +25,7 @@ def main(arguments: list[str] | None = None) -> None:
     chosen = parser.parse_args(arguments)
     try:
         store = SceneStore(chosen.store)
-        scene = store[_scene_index(store, chosen.scene)]
+        scene = store[store.find(chosen.scene)]
     except SceneError as error:
         parser.error(str(error))
     if chosen.out.suffix.lower() not in (".png", ".gif"):
@@ -37,17 +38,8 @@ def main(arguments: list[str] | None = None) -> None:
             parser.error(f"--radius must be greater than 0 m, got {chosen.radius}")
         view = view._replace(radius=chosen.radius)
     steps = range(LOG_STEPS) if chosen.out.suffix.lower() == ".gif" else [chosen.step]
-    save_picture(chosen.out, render_frames(scene, steps=steps, view=view, pixels=chosen.pixels))
-
-
-def _scene_index(store: SceneStore, name: str) -> int:
-    """A scene id may itself be all digits, so ids come first and indices second."""
-    try:
-        return store.index_of(name)
-    except SceneError:
-        if name.isdecimal() and int(name) < len(store):
-            return int(name)
-        raise
+    frames = render_frames(scene, steps=steps, view=view, pixels=chosen.pixels)
+    save_picture(chosen.out, progress(frames, "draw", total=len(steps), unit="frame", disable=len(steps) == 1))
 
 
 if __name__ == "__main__":

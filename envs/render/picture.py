@@ -18,8 +18,8 @@ from PIL import Image
 from torch import Tensor
 
 from envs.render.layers import View, draw_agents, draw_map, draw_trails, fit_view, frame_view, pose_tracks
-from envs.render.style import AGENT_COLORS, INK_COLOR, LIGHT_STYLE, SDC_COLOR
-from envs.scene import CURRENT_STEP, LOG_STEPS, STEP_SECONDS, AgentKind, Scene
+from envs.render.style import AGENT_COLORS, INK_COLOR, LIGHT_GROUP, LIGHT_STYLE, SDC_COLOR, STOP_SIGN_COLOR
+from envs.scene import CURRENT_STEP, LOG_STEPS, STEP_SECONDS, AgentKind, MapKind, Scene
 
 
 def draw_scene(
@@ -198,14 +198,25 @@ _LETTERS = {
 }
 
 
+def legend_handles(scene: Scene) -> list[Line2D]:
+    """Marks of the agent classes, the stop signs and the states of lights that a scene has."""
+    kinds = sorted(set(scene.agents.kind[~scene.agents.sdc].tolist()))
+    marks = [("SDC", "s", SDC_COLOR)] + [(AgentKind(k).name.capitalize(), "s", AGENT_COLORS[k]) for k in kinds]
+    if (scene.road.kind == MapKind.STOP_SIGN).any():
+        marks.append(("Stop sign", "o", STOP_SIGN_COLOR))
+    groups = {LIGHT_GROUP[state] for state in scene.lights.state.unique().tolist() if state in LIGHT_GROUP}
+    marks += [(f"Light: {group}", *mark) for group, mark in LIGHT_STYLE.items() if group in groups]
+    return [
+        Line2D([], [], marker=marker, ls="", ms=6, mec="white", mfc=color, label=name) for name, marker, color in marks
+    ]
+
+
 def _draw_legend(axes: Axes, scene: Scene) -> None:
-    """Classes that the scene has, and a bar of 20 m (on the ground, so that it is right in any window)."""
-    kinds = set(scene.agents.kind[~scene.agents.sdc].tolist())
-    entries = [("SDC", SDC_COLOR)] + [(AgentKind(k).name.capitalize(), AGENT_COLORS[k]) for k in sorted(kinds)]
-    handles = [Line2D([], [], marker="s", ls="", ms=6, mec="white", mfc=color, label=name) for name, color in entries]
+    """What the scene has, and a bar of 20 m (on the ground, so that it is right in any window)."""
     legend = axes.legend(
-        handles=handles, loc="upper left", fontsize=8, labelcolor=INK_COLOR, frameon=True, facecolor="white",
-        edgecolor="none", framealpha=0.85, handletextpad=0.2, borderpad=0.5, borderaxespad=0.6, labelspacing=0.35,
+        handles=legend_handles(scene), loc="upper left", fontsize=8, labelcolor=INK_COLOR, frameon=True,
+        facecolor="white", edgecolor="none", framealpha=0.85, handletextpad=0.2, borderpad=0.5, borderaxespad=0.6,
+        labelspacing=0.35,
     )  # fmt: skip
     legend.set_zorder(12)
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()

@@ -22,6 +22,7 @@ INK_COLOR = "#3c4043"
 """Letters and scale bars."""
 GROUND_COLOR = "#edeeea"
 
+STOP_SIGN_COLOR = "#b3261e"
 _WHITE, _YELLOW = "#c3c8cd", "#dcb94a"
 
 
@@ -59,7 +60,7 @@ MAP_LAYERS = (
         (MapKind.LINE_BROKEN_YELLOW, MapKind.LINE_BROKEN_DOUBLE_YELLOW, MapKind.LINE_PASSING_YELLOW),
     ),
     MapLayer("line", "#8b9096", 1.1, EDGE_KINDS),
-    MapLayer("dot", "#b3261e", 5.0, (MapKind.STOP_SIGN,)),
+    MapLayer("dot", STOP_SIGN_COLOR, 5.0, (MapKind.STOP_SIGN,)),
 )
 """The map from the ground up."""
 

@@ -15,8 +15,11 @@ from PIL import Image
 
 from envs.render import View, box_corners, fit_view, pose_tracks, render_frame, render_frames, save_picture, style
 from envs.render import __main__ as command_line
-from envs.scene import CURRENT_STEP, LOG_STEPS, AgentKind, Scene, SceneError
+from envs.render.picture import legend_handles
+from envs.scene import CURRENT_STEP, LOG_STEPS, AgentKind, Scene
+from envs.shards import file_digest, write_shard
 from envs.sources.synthetic import red_light, straight_road, two_cars_head_on
+from envs.store import Manifest, write_manifest
 
 HERE = View(0.0, 0.0, 50.0)
 PIXELS = 500
@@ -122,7 +125,7 @@ def test_a_red_light_is_drawn_at_its_stop_point_and_only_while_listed() -> None:
     red = style.LIGHT_STYLE[style.STOP][1]
     at = pixel(20, -2.5)
     assert shown(render_frame(scene, step=0, view=HERE, trails=False, pixels=PIXELS), red)[at]
-    assert not shown(render_frame(scene, step=40, view=HERE, trails=False, pixels=PIXELS), red).any()
+    assert not shown(render_frame(scene, step=40, view=HERE, trails=False, pixels=PIXELS), red)[at]
 
 
 def test_frames_of_an_animation_equal_single_pictures() -> None:
@@ -161,47 +164,52 @@ def test_a_gif_keeps_the_colour_of_a_class_that_is_a_few_pixels_large(tmp_path: 
         assert shown(picture, style.AGENT_COLORS[kind])[pixel(x - 0.5, -2.5)], kind
 
 
-class FakeStore:
-    """What the command needs of a store: scenes by index, and an index by scene id."""
-
-    scenes = (straight_road(1), two_cars_head_on())
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    def __len__(self) -> int:
-        return len(self.scenes)
-
-    def __getitem__(self, index: int) -> Scene:
-        return self.scenes[index]
-
-    def index_of(self, scene_id: str) -> int:
-        for index, scene in enumerate(self.scenes):
-            if scene.scene_id == scene_id:
-                return index
-        raise SceneError(f"no scene {scene_id!r}")
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    """A store with the scenes ``straight_road`` and ``two_cars_head_on``."""
+    folder = tmp_path / "store"
+    folder.mkdir()
+    write_shard(folder / "00000", [straight_road(1), two_cars_head_on()], [("made", 0), ("made", 1)])
+    shards = [{"name": "00000", "scenes": 2, "sha256": file_digest(folder / "00000" / "shard.json")}]
+    write_manifest(folder, Manifest("made", {}, "", complete=True, shards=shards))
+    return folder
 
 
-def test_the_command_finds_a_scene_by_id_and_by_index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command_line, "SceneStore", FakeStore)
+def test_the_command_finds_a_scene_by_id_and_by_index(store: Path, tmp_path: Path) -> None:
     for name in ("two_cars_head_on", "1"):
-        command_line.main(["store", "--scene", name, "--out", str(tmp_path / f"{name}.png"), "--pixels", "120"])
+        command_line.main([str(store), "--scene", name, "--out", str(tmp_path / f"{name}.png"), "--pixels", "120"])
     assert (tmp_path / "1.png").read_bytes() == (tmp_path / "two_cars_head_on.png").read_bytes()
-    command_line.main(["store", "--scene", "0", "--out", str(tmp_path / "film.gif"), "--pixels", "80"])
+    command_line.main([str(store), "--scene", "0", "--out", str(tmp_path / "film.gif"), "--pixels", "80"])
     with Image.open(tmp_path / "film.gif") as gif:
         # Pillow may merge equal frames, but the cars move in every step.
         assert gif.n_frames == LOG_STEPS
 
 
-@pytest.mark.parametrize("extra", [["--scene", "nowhere"], ["--scene", "2"], ["--scene", "0", "--radius", "-3"]])
+@pytest.mark.parametrize(
+    "extra",
+    [
+        ["--scene", "nowhere"],
+        ["--scene", "2"],
+        ["--scene", "0", "--radius", "-3"],
+        ["--scene", "0", "--step", "91"],
+        ["--scene", "0", "--out", "scene.svg"],
+    ],
+)
 def test_the_command_refuses_what_it_cannot_draw(
-    extra: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    extra: list[str], store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(command_line, "SceneStore", FakeStore)
     with pytest.raises(SystemExit):
-        command_line.main(["store", "--out", str(tmp_path / "x.png"), *extra])
+        command_line.main([str(store), "--out", str(tmp_path / "x.png"), *extra])
     assert extra[-1].strip("-") in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
+    assert list(tmp_path.iterdir()) == [store]
+
+
+def test_the_legend_names_lights_and_stop_signs_where_the_scene_has_them() -> None:
+    def names(scene: Scene) -> list[str]:
+        return [handle.get_label() for handle in legend_handles(scene)]
+
+    assert names(straight_road(2)) == ["SDC", "Vehicle"]
+    assert names(red_light())[-1] == "Light: stop"
 
 
 if __name__ == "__main__":

@@ -52,6 +52,7 @@ SECTIONS = {
     "collect": ("threads", "scenes", "collection"),
     "align": ("threads", "scenes", "alignment"),
     "evaluate": ("threads", "scenes", "collection", "evaluation"),
+    "play": ("threads", "scenes"),
     "tokens": ("threads", "scenes", "model"),
     "compare": ("threads", "scenes", "model", "pretraining", "collection", "alignment", "evaluation"),
 }

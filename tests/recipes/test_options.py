@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from dpa.ranking import PreferenceDistance
 from recipes.cli import build, finished, write_json
 
-RECIPES = ("pretrain", "collect", "align", "evaluate", "tokens", "compare")
+RECIPES = ("pretrain", "collect", "align", "evaluate", "play", "tokens", "compare")
 pytestmark = pytest.mark.usefixtures("stores")
 
 
@@ -63,14 +63,15 @@ def test_an_unknown_key_is_told_by_name(run: Callable, recipe: str) -> None:
 
 @pytest.mark.parametrize("recipe", ["collect", "align", "evaluate"])
 def test_an_option_that_is_missing_is_told_by_name(run: Callable, options: Callable, recipe: str) -> None:
-    assert_refused(run(recipe, *options(recipe)), "policy")
+    assert_refused(run(recipe, *options(recipe)), "policy is not given; say policy=VALUE")
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_scenes_that_do_not_exist_are_told_by_path(
     run: Callable, options: Callable, recipe: str, tmp_path: Path
 ) -> None:
-    more = [] if recipe in ("pretrain", "tokens", "compare") else ["policy=none.pt"]
+    more = [] if recipe in ("pretrain", "tokens", "compare", "play") else ["policy=none.pt"]
+    more += ["policies=none.pt"] if recipe == "play" else []
     command = options(recipe, *more, "scenes.train=nowhere", f"{output_of(recipe)}={tmp_path / 'out'}")
     assert_refused(run(recipe, *command), "nowhere")
 

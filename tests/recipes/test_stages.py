@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -28,7 +29,7 @@ from recipes.candidates import Group, pair_accuracy
 from recipes.evaluate import SCENE_FIGURES, standing_moved
 from recipes.models import open_policy
 from recipes.partial import PartialResult
-from recipes.pool import Job, run_jobs
+from recipes.pool import Job, Workers
 
 METHODS = ("dpa_omf", "dpa_adef", "sft_best_oa", "sft_best_ade", "adversarial_afd")
 
@@ -312,26 +313,51 @@ def test_the_loss_of_tokenization_is_measured(run: Callable, options: Callable, 
     assert errors["pedestrian all"] == {"poses": 0}
 
 
+# --- play -----------------------------------------------------------------------------------------------------------
+def test_rollouts_of_some_policies_make_a_page_that_plays(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(runs / "reference", tmp_path / "other")
+    policies = f"[{runs / 'reference/policy.pt'},{tmp_path / 'other/policy.pt'}]"
+    page = tmp_path / "play.html"
+    outcome = run("play", *options("play", f"policies={policies}", "show=[1,0]", "num_rollouts=2", f"output={page}"))
+    assert outcome.status == 0, outcome.err
+    text = page.read_text(encoding="utf-8")
+    assert '"reference"' in text and '"other"' in text and "top-p 0.95" in text
+
+
+def test_a_scene_to_play_that_is_not_there_is_told(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path
+) -> None:
+    policy, page = runs / "reference/policy.pt", tmp_path / "play.html"
+    outcome = run("play", *options("play", f"policies={policy}", "show=[nowhere]", f"output={page}"))
+    assert outcome.status == 2 and "no scene 'nowhere'" in outcome.err
+    assert not page.exists()
+
+
 # --- jobs -----------------------------------------------------------------------------------------------------------
 def test_jobs_run_here_one_after_the_other() -> None:
     ran: list[int] = []
-    run_jobs([Job(ran.append, (number,), f"job {number}") for number in range(3)], workers=1, threads=1, name="jobs")
+    with Workers(1, threads=1) as workers:
+        workers.run([Job(ran.append, (number,), f"job {number}") for number in range(3)], "jobs")
     assert ran == [0, 1, 2]
 
 
-def test_the_error_of_a_job_is_the_error_of_all() -> None:
-    with pytest.raises(ValueError, match="Expecting property name"):
-        run_jobs([Job(json.loads, ("{",), "bad")], workers=2, threads=1, name="jobs")
+def test_the_error_of_a_job_is_the_error_of_all_and_the_workers_go_on() -> None:
+    with Workers(2, threads=1) as workers:
+        with pytest.raises(ValueError, match="Expecting property name"):
+            workers.run([Job(json.loads, ("{",), "bad")], "jobs")
+        workers.run([Job(json.loads, ("{}",), "good")], "jobs")
 
 
 def test_a_killed_worker_is_told_with_what_to_do() -> None:
-    with pytest.raises(ChildProcessError, match="a worker of 'jobs' was killed.*workers=1"):
-        run_jobs([Job(os._exit, (1,), "dies")], workers=2, threads=1, name="jobs")
+    with Workers(2, threads=1) as workers, pytest.raises(ChildProcessError, match="'jobs' was killed.*workers=1"):
+        workers.run([Job(os._exit, (1,), "dies")], "jobs")
 
 
 def test_a_number_of_workers_that_is_not_positive_is_refused() -> None:
     with pytest.raises(ValueError, match="workers must be 1 or more, got 0"):
-        run_jobs([], workers=0, threads=1, name="jobs")
+        Workers(0, threads=1)
 
 
 if __name__ == "__main__":
