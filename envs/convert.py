@@ -290,14 +290,16 @@ def _parser() -> argparse.ArgumentParser:
         ("info", "say what a store holds"),
         ("verify", "compare a store with its checksums and validate every scene"),
     ):
-        commands.add_parser(name, help=help_text).add_argument("out", metavar="OUT", help="folder of the store")
+        command = commands.add_parser(name, help=help_text, description=f"{help_text.capitalize()}.")
+        command.add_argument("out", metavar="OUT", help="folder of the store")
+        command.add_argument("--ids", action="store_true", help="list the scenes too: index, id and number of agents")
     return parser
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; returns the exit status."""
     options = vars(_parser().parse_args(arguments))
-    command, out = options.pop("command"), options.pop("out")
+    command, out, ids = options.pop("command"), options.pop("out"), options.pop("ids", False)
     try:
         if command in SOURCES:
             store = convert(command, options.pop("paths"), out, show_progress=True, **options)
@@ -307,6 +309,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             with progress(total=len(store), description="verify", unit="scene") as bar:
                 store.verify(bar.update)
         sys.stdout.write(describe(store) + "\n")
+        if ids:
+            rows = zip(store.scene_ids, store.num_agents.tolist(), strict=True)
+            sys.stdout.writelines(f"{index:>8}  {name}  {agents}\n" for index, (name, agents) in enumerate(rows))
     except ValueError as error:
         sys.stderr.write(f"error: {error}\n")
         return BAD_INPUT_STATUS

@@ -190,6 +190,8 @@ def test_info_and_verify(raw: Path, tmp_path: Path, capsys) -> None:
     convert("womd", [raw], out)
     assert main(["info", str(out)]) == 0
     assert "7 in 1 shards" in capsys.readouterr().out
+    assert main(["info", str(out), "--ids"]) == 0
+    assert capsys.readouterr().out.splitlines()[-7].split()[:2] == ["0", "scene0"]
     assert main(["verify", str(out)]) == 0
     (out / "00000/agents/kind.memmap").write_bytes(bytes(13))
     assert main(["verify", str(out)]) == 2

@@ -8,10 +8,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from omegaconf import OmegaConf
+import torch
+from omegaconf import DictConfig, OmegaConf
 
 from dpa.ranking import PreferenceDistance
-from recipes.cli import build, finished, write_json
+from recipes.cli import build, finished, recipe, write_json
 
 RECIPES = ("pretrain", "collect", "align", "evaluate", "play", "tokens", "compare")
 pytestmark = pytest.mark.usefixtures("stores")
@@ -213,6 +214,36 @@ def test_a_section_that_lacks_an_option_is_told() -> None:
 
     with pytest.raises(ValueError, match="method.loss missing a required argument: 'alpha'"):
         build(target, OmegaConf.create({}), "method.loss")
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_an_interrupt_says_how_to_go_on(hidden: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    @recipe
+    def main(cfg: DictConfig) -> None:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            if hidden:  # as tensordict does while it has swapped a module's parameters
+                raise RuntimeError("parameters")  # noqa: B904
+            raise
+
+    with pytest.raises(SystemExit) as stop:
+        main(OmegaConf.create({"threads": 1, "device": "cpu"}))
+    assert stop.value.code == 130
+    assert capsys.readouterr().err == "interrupted; run the same command again to go on\n"
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_device_that_is_not_there_is_told_before_any_work(run: Callable, options: Callable, tmp_path: Path) -> None:
+    command = options("pretrain", "device=cuda", f"output={tmp_path / 'out'}")
+    assert_refused(run("pretrain", *command), "device=cuda", "say device=cpu")
+    assert not (tmp_path / "out").exists()
+
+
+def test_more_pairs_than_rollouts_are_refused(run: Callable, options: Callable, runs: Path, tmp_path: Path) -> None:
+    policy, store = runs / "reference/policy.pt", runs / "preferences"
+    command = options("align", f"policy={policy}", f"preferences={store}", f"output={tmp_path / 'out'}")
+    assert_refused(run("align", *command), "method.data.num=8 needs 16 rollouts of a scene and the store holds 4")
 
 
 def test_a_section_becomes_the_arguments_of_a_class() -> None:
