@@ -2,8 +2,20 @@
 
 from __future__ import annotations
 
-from dpa.realism.config import Histogram, Indicator, RealismConfig
+from dpa.realism.config import Histogram, Indicator, Kernel, RealismConfig
 from dpa.realism.features import Features, measure
 from dpa.realism.metric import RealismResult, mean_result, realism
+from dpa.realism.quirks import Quirk
 
-__all__ = ["Features", "Histogram", "Indicator", "RealismConfig", "RealismResult", "mean_result", "measure", "realism"]
+__all__ = [
+    "Features",
+    "Histogram",
+    "Indicator",
+    "Kernel",
+    "Quirk",
+    "RealismConfig",
+    "RealismResult",
+    "mean_result",
+    "measure",
+    "realism",
+]

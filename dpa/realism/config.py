@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import yaml
 
+from dpa.realism.quirks import Quirk
+
 FOLDER = Path(__file__).parent / "config"
 """Where the named configurations live."""
+
+Differences = Literal["central", "backward"]
+"""How speeds come from positions."""
 
 BUCKETS: dict[str, tuple[str, ...]] = {
     "kinematic": ("linear_speed", "linear_acceleration", "angular_speed", "angular_acceleration"),
@@ -19,7 +24,7 @@ BUCKETS: dict[str, tuple[str, ...]] = {
     "map_based": ("distance_to_road_edge", "offroad_indication", "traffic_light_violation"),
 }
 """Metrics of each part of the meta-metric (SPEC section 7)."""
-HISTOGRAMS = (*BUCKETS["kinematic"], "distance_to_nearest_object", "time_to_collision", "distance_to_road_edge")
+CONTINUOUS = (*BUCKETS["kinematic"], "distance_to_nearest_object", "time_to_collision", "distance_to_road_edge")
 INDICATORS = ("collision_indication", "offroad_indication", "traffic_light_violation")
 
 
@@ -33,6 +38,8 @@ class Histogram:
         bins: number of bins.
         pseudocount: added to the count of every bin.
         weight: of the feature in the meta-metric.
+        pooled: one distribution for all agents of a scene, instead of one for each.
+        per_step: one distribution for each step, instead of one for all.
     """
 
     low: float
@@ -40,6 +47,25 @@ class Histogram:
     bins: int
     pseudocount: float
     weight: float
+    pooled: bool = False
+    per_step: bool = False
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """How a continuous feature is scored by a Gaussian kernel density instead; no challenge does.
+
+    Attributes:
+        bandwidth: standard deviation of the kernel, in the unit of the feature.
+        weight: of the feature in the meta-metric.
+        pooled: see :class:`Histogram`.
+        per_step: see :class:`Histogram`.
+    """
+
+    bandwidth: float
+    weight: float
+    pooled: bool = False
+    per_step: bool = False
 
 
 @dataclass(frozen=True)
@@ -49,10 +75,12 @@ class Indicator:
     Attributes:
         pseudocount: added to both counts.
         weight: of the event in the meta-metric.
+        pooled: one probability for all agents of a scene, instead of one for each.
     """
 
     pseudocount: float
     weight: float
+    pooled: bool = False
 
 
 @dataclass(frozen=True)
@@ -61,10 +89,13 @@ class RealismConfig:
 
     Attributes:
         name: of the configuration, for messages.
+        differences: ``"central"``, or ``"backward"`` as in 2023.
         corner_rounding: radius of the corners of a box, as a part of half its shorter side.
+        height_stretch: how much a metre of height counts when the nearest road edge is chosen.
         ttc_vehicle_only: score the time to collision of vehicles only.
         traffic_lights: score driving through red lights.
-        histograms: for each name in :data:`HISTOGRAMS`.
+        quirks: of the official code that are kept.
+        continuous: for each name in :data:`CONTINUOUS`.
         indicators: for each name in :data:`INDICATORS`.
 
     Examples:
@@ -73,13 +104,18 @@ class RealismConfig:
         0.25
         >>> config.replace(ttc_vehicle_only=True).ttc_vehicle_only
         True
+        >>> Quirk.UNWRAPPED_TURN in config.quirks, config.replace(quirks=frozenset()).quirks
+        (True, frozenset())
     """
 
     name: str
+    differences: Differences
     corner_rounding: float
+    height_stretch: float
     ttc_vehicle_only: bool
     traffic_lights: bool
-    histograms: Mapping[str, Histogram]
+    quirks: frozenset[Quirk]
+    continuous: Mapping[str, Histogram | Kernel]
     indicators: Mapping[str, Indicator]
 
     @classmethod
@@ -101,15 +137,17 @@ class RealismConfig:
         except yaml.YAMLError as error:
             raise ValueError(f"{path} is not YAML: {error}") from None
         _check_keys(data, {field.name for field in dataclasses.fields(cls)} - {"name"}, path, "the file")
-        config = cls(
+        plain = {"corner_rounding": float, "height_stretch": float, "ttc_vehicle_only": bool, "traffic_lights": bool}
+        return cls(
             name=path.stem,
-            corner_rounding=_read(float, data["corner_rounding"], path, "corner_rounding"),
-            ttc_vehicle_only=_read(bool, data["ttc_vehicle_only"], path, "ttc_vehicle_only"),
-            traffic_lights=_read(bool, data["traffic_lights"], path, "traffic_lights"),
-            histograms=_read_group(Histogram, data["histograms"], HISTOGRAMS, path, "histograms"),
-            indicators=_read_group(Indicator, data["indicators"], INDICATORS, path, "indicators"),
+            differences=_choice(data["differences"], get_args(Differences), path, "differences"),
+            quirks=frozenset(
+                Quirk(_choice(name, [*Quirk], path, "quirks")) for name in _read(list, data["quirks"], path, "quirks")
+            ),
+            continuous=_read_group(data["continuous"], CONTINUOUS, path, "continuous"),
+            indicators=_read_group(data["indicators"], INDICATORS, path, "indicators"),
+            **{name: _read(kind, data[name], path, name) for name, kind in plain.items()},
         )
-        return config
 
     def __post_init__(self) -> None:
         weight = self.indicators["traffic_light_violation"].weight
@@ -126,21 +164,34 @@ class RealismConfig:
     @property
     def weights(self) -> dict[str, float]:
         """Weight of every scored metric, by name."""
-        weights = {name: part.weight for name, part in {**self.histograms, **self.indicators}.items()}
+        weights = {name: part.weight for name, part in {**self.continuous, **self.indicators}.items()}
         if not self.traffic_lights:
             del weights["traffic_light_violation"]
         return weights
 
 
-def _read_group(cls: type, data: Any, names: tuple[str, ...], path: Path, where: str) -> dict[str, Any]:
+def _read_group(data: Any, names: tuple[str, ...], path: Path, where: str) -> dict[str, Any]:
     _check_keys(data, set(names), path, where)
-    kinds = {field.name: {"int": int, "float": float}[field.type] for field in dataclasses.fields(cls)}
-    group = {}
-    for name in names:
-        _check_keys(data[name], set(kinds), path, f"{where}.{name}")
-        values = {key: _read(kind, data[name][key], path, f"{where}.{name}.{key}") for key, kind in kinds.items()}
-        group[name] = cls(**values)
-    return group
+    return {name: _read_estimator(data[name], path, f"{where}.{name}") for name in names}
+
+
+def _read_estimator(data: Any, path: Path, where: str) -> Histogram | Kernel | Indicator:
+    """The estimator whose keys the entry has."""
+    if where.startswith("indicators."):
+        cls: type = Indicator
+    else:
+        cls = Kernel if isinstance(data, dict) and "bandwidth" in data else Histogram
+    fields = {field.name: field for field in dataclasses.fields(cls)}
+    optional = {name for name, field in fields.items() if field.default is not dataclasses.MISSING}
+    _check_keys(data, set(fields), path, where, optional)
+    kinds = {"int": int, "float": float, "bool": bool}
+    return cls(**{key: _read(kinds[fields[key].type], value, path, f"{where}.{key}") for key, value in data.items()})
+
+
+def _choice(value: Any, known: Sequence[str], path: Path, where: str) -> Any:
+    if value not in known:
+        raise ValueError(f"{path}: {where} must be one of {', '.join(known)}, got {value!r}.")
+    return value
 
 
 def _read(kind: type, value: Any, path: Path, where: str) -> Any:
@@ -150,10 +201,10 @@ def _read(kind: type, value: Any, path: Path, where: str) -> Any:
     return kind(value)
 
 
-def _check_keys(data: Any, expected: set[str], path: Path, where: str) -> None:
+def _check_keys(data: Any, expected: set[str], path: Path, where: str, optional: Set[str] = frozenset()) -> None:
     if not isinstance(data, dict):
         raise ValueError(f"{path}: {where} must map the keys {sorted(expected)} to values, got {data!r}.")
-    unknown, missing = sorted(map(str, set(data) - expected)), sorted(expected - set(data))
+    unknown, missing = sorted(map(str, set(data) - expected)), sorted(expected - optional - set(data))
     if unknown or missing:
         raise ValueError(
             f"{path}: {where} has unknown keys {unknown} and lacks {missing}; it needs {sorted(expected)}."

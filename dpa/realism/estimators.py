@@ -2,41 +2,76 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
-from dpa.realism.config import Histogram, Indicator
+from dpa.realism.config import Histogram, Indicator, Kernel
 
 
-def histogram_log_likelihood(log: Tensor, simulated: Tensor, config: Histogram) -> Tensor:
-    """Score each logged value against one histogram for each agent, of all its simulated values.
+def log_likelihood(
+    log: Tensor, simulated: Tensor, config: Histogram | Kernel, counted: Tensor | None = None, *, keep_nan: bool = True
+) -> Tensor:
+    """Score each logged value against a distribution of simulated values.
 
-    Values outside the range fall into the end bins. A value that is NaN falls into the last bin, as in the official
-    code: the differences at the end of a rollout are NaN, and they are counted.
+    By default each agent has one distribution of all its steps in all rollouts; ``config.pooled`` shares it among
+    agents and ``config.per_step`` gives each step one of its own (SPEC section 6.1).
 
     Args:
         log: ``[E, T]``.
         simulated: ``[R, E, T]``.
-        config: range and bins.
+        config: of the estimator.
+        counted: ``[E, T]`` bool, which simulated values take part; all by default, as in the official code.
+        keep_nan: a simulated NaN is a sample of the last bin, as in the official code; without, it is none. A kernel
+            density never has it.
 
     Returns:
-        ``[E, T]`` [nats].
+        ``[E, T]`` [nats]; NaN where a distribution has no sample and no pseudocount.
 
     Examples:
         >>> config = Histogram(low=0.0, high=2.0, bins=2, pseudocount=0.1, weight=1.0)
-        >>> score = histogram_log_likelihood(torch.tensor([[0.5, 1.5]]), torch.tensor([[[0.2, 0.3]]]), config)
+        >>> score = log_likelihood(torch.tensor([[0.5, 1.5]]), torch.tensor([[[0.2, 0.3]]]), config)
         >>> score.exp().round(decimals=4)
         tensor([[0.9545, 0.0455]])
     """
-    num_agents = log.shape[0]
-    # every agent has its own row of bins in one flat count
-    offset = torch.arange(num_agents, device=log.device)[:, None] * config.bins
-    log_bin = _bin(log, config) + offset
-    simulated_bin = _bin(simulated, config) + offset
-    count = torch.bincount(simulated_bin.flatten(), minlength=num_agents * config.bins).to(log.dtype)
-    samples = simulated.shape[0] * simulated.shape[2]
-    probability = (count + config.pseudocount) / (samples + config.bins * config.pseudocount)
-    return probability.log()[log_bin]
+    group = _groups(log, config)
+    sample = torch.ones_like(simulated, dtype=torch.bool) if counted is None else counted.expand(simulated.shape)
+    if not keep_nan or isinstance(config, Kernel):
+        sample = sample & ~simulated.isnan()
+    estimate = _histogram if isinstance(config, Histogram) else _kernel
+    return estimate(log, group, simulated[sample], group.expand(simulated.shape)[sample], config)
+
+
+def _groups(log: Tensor, config: Histogram | Kernel) -> Tensor:
+    """Which distribution each value belongs to, ``[E, T]`` int64 from 0."""
+    agents, steps = log.shape
+    agent = torch.zeros(agents, 1, dtype=torch.int64, device=log.device)
+    if not config.pooled:
+        agent = torch.arange(agents, device=log.device)[:, None]
+    if config.per_step:
+        return agent * steps + torch.arange(steps, device=log.device)
+    return agent.expand(-1, steps)
+
+
+def _histogram(log: Tensor, group: Tensor, samples: Tensor, sample_group: Tensor, config: Histogram) -> Tensor:
+    """Log of the smoothed share of samples in the bin of each logged value (SPEC section 6.2)."""
+    groups = int(group.max()) + 1
+    # every distribution has its own row of bins in one flat count
+    count = torch.bincount(_bin(samples, config) + sample_group * config.bins, minlength=groups * config.bins)
+    count = count.to(log.dtype).view(groups, config.bins)
+    total = count.sum(1, keepdim=True) + config.bins * config.pseudocount
+    return ((count + config.pseudocount) / total).log()[group, _bin(log, config)]
+
+
+def _kernel(log: Tensor, group: Tensor, samples: Tensor, sample_group: Tensor, config: Kernel) -> Tensor:
+    """Log of the mean kernel between the samples and each logged value; 0 at most (SPEC section 6.4)."""
+    score = torch.full_like(log, torch.nan)
+    for each in group.unique():
+        own, values = group == each, samples[sample_group == each]
+        distance = (log[own, None] - values) / config.bandwidth
+        score[own] = torch.logsumexp(-distance.square() / 2, -1) - math.log(max(1, len(values)))
+    return score
 
 
 def indicator_log_likelihood(log: Tensor, simulated: Tensor, config: Indicator) -> Tensor:
@@ -45,7 +80,7 @@ def indicator_log_likelihood(log: Tensor, simulated: Tensor, config: Indicator) 
     Args:
         log: ``[E]`` bool.
         simulated: ``[R, E]`` bool.
-        config: pseudocount.
+        config: pseudocount; ``pooled`` shares one probability among agents.
 
     Returns:
         ``[E]`` [nats].
@@ -55,13 +90,15 @@ def indicator_log_likelihood(log: Tensor, simulated: Tensor, config: Indicator) 
         >>> indicator_log_likelihood(torch.tensor([True]), torch.tensor([[True], [False]]), config).exp()
         tensor([0.5000])
     """
-    true = simulated.sum(0).float()
-    count = torch.where(log, true, simulated.shape[0] - true)
-    return ((count + config.pseudocount) / (simulated.shape[0] + 2 * config.pseudocount)).log()
+    true, samples = simulated.sum(0).float(), simulated.shape[0]
+    if config.pooled:
+        true, samples = true.sum().expand_as(true), simulated.numel()
+    count = torch.where(log, true, samples - true)
+    return ((count + config.pseudocount) / (samples + 2 * config.pseudocount)).log()
 
 
 def _bin(value: Tensor, config: Histogram) -> Tensor:
-    """Index of the bin ``[left, right)`` of each value; the last bin is closed and takes NaN."""
+    """Index of the bin ``[left, right)`` of each value; the end bins take what lies beyond, the last one NaN."""
     edges = histogram_edges(config).to(value.device)
     index = torch.bucketize(value.contiguous(), edges, right=True) - 1
     return torch.where(value.isnan(), config.bins - 1, index.clamp(0, config.bins - 1))

@@ -11,9 +11,11 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from dpa.realism.config import RealismConfig
+from dpa.realism.config import Differences, RealismConfig
 from dpa.realism.lights import red_light_violation
+from dpa.realism.quirks import Quirk
 from envs.geometry.boxes import nearest_box_distance
 from envs.geometry.edges import RoadEdges
 from envs.geometry.frames import rotate, wrap_angle
@@ -55,7 +57,7 @@ class Features:
         values: name to ``[C, E, 80]``; float for continuous features, bool for ``collision_per_step``,
             ``offroad_per_step`` and, if asked for, ``traffic_light_violation_per_step``.
         displacement: ``[R, E]``, mean distance from the log over all 91 steps [m].
-        valid: ``[E, 80]`` bool, the agent is there in the log.
+        valid: ``[E, 82]`` bool, the agent is there in the log, from two steps before the first measured one on.
         vehicle: ``[E]`` bool.
         track_id: ``[E]`` int64.
     """
@@ -99,14 +101,20 @@ def measure(scene: Scene, simulated: Tensor, config: RealismConfig) -> Features:
     agents = scene.agents
     ego = agents.evaluated.nonzero()[:, 0]
     ego = ego[agents.track_id[ego].argsort()]
-    tracks = _join(scene, simulated, ego)
+    tracks = _join(scene, simulated, ego, ghosts=Quirk.GHOSTS in config.quirks)
     distance = _nearest_object(tracks, config.corner_rounding)
-    road_edge = _road_edge(tracks, RoadEdges.from_polylines(polylines(scene, EDGE_KINDS)))
+    edges = RoadEdges.from_polylines(
+        polylines(scene, EDGE_KINDS),
+        every_ring=Quirk.LONGEST_RING not in config.quirks,
+        height_stretch=config.height_stretch,
+        points_at_zero=Quirk.POINTS_AT_ZERO in config.quirks,
+    )
+    road_edge = _road_edge(tracks, edges)
     values = {
-        **_kinematics(tracks),
+        **_kinematics(tracks, config),
         "distance_to_nearest_object": distance,
         "collision_per_step": distance < 0,
-        "time_to_collision": _time_to_collision(tracks),
+        "time_to_collision": _time_to_collision(tracks, config),
         "distance_to_road_edge": road_edge,
         "offroad_per_step": road_edge > 0,
     }
@@ -114,11 +122,11 @@ def measure(scene: Scene, simulated: Tensor, config: RealismConfig) -> Features:
         # a crossing compares a step with the one before it
         steps = slice(_CONTEXT - 1, None)
         position, valid = tracks.position[:, ego, steps, :2], tracks.valid[:, ego, steps]
-        values["traffic_light_violation_per_step"] = red_light_violation(scene, position, valid)
+        values["traffic_light_violation_per_step"] = red_light_violation(scene, position, valid, config.quirks)
     return Features(
         values=values,
-        displacement=_displacement(scene, simulated, ego),
-        valid=agents.valid[ego, -HORIZON:],
+        displacement=_displacement(scene, simulated, ego, Quirk.HISTORY_IN_ADE in config.quirks),
+        valid=agents.valid[ego, -HORIZON - _CONTEXT :],
         vehicle=agents.kind[ego] == AgentKind.VEHICLE,
         track_id=agents.track_id[ego],
     )
@@ -151,7 +159,7 @@ def to_world(scene: Scene, simulated: Tensor) -> tuple[Scene, Tensor]:
     return moved, torch.cat((move(simulated[..., :3]), simulated[..., 3:]), -1)
 
 
-def _join(scene: Scene, simulated: Tensor, ego: Tensor) -> _Tracks:
+def _join(scene: Scene, simulated: Tensor, ego: Tensor, ghosts: bool) -> _Tracks:
     """Put the log, then the rollouts behind their logged context, side by side (SPEC section 1.6)."""
     agents = scene.agents
     steps = slice(-HORIZON - _CONTEXT, None)
@@ -163,6 +171,8 @@ def _join(scene: Scene, simulated: Tensor, ego: Tensor) -> _Tracks:
     heading_context = heading[:, :_CONTEXT].expand(rollouts, -1, -1)
     simulated_valid = valid.clone()
     simulated_valid[:, _CONTEXT:] = True
+    if ghosts:
+        valid = simulated_valid
     return _Tracks(
         position=torch.cat((position[None], torch.cat((context, simulated[..., :3]), 2))),
         heading=torch.cat((heading[None], torch.cat((heading_context, simulated[..., 3]), 2))),
@@ -172,35 +182,47 @@ def _join(scene: Scene, simulated: Tensor, ego: Tensor) -> _Tracks:
     )
 
 
-def _central_difference(value: Tensor) -> Tensor:
-    """Half the difference of the two neighbours along the last dim; NaN at both ends."""
-    inside = (value[..., 2:] - value[..., :-2]) / 2
-    return torch.nn.functional.pad(inside, (1, 1), value=torch.nan)
+def _difference(value: Tensor, kind: Differences) -> Tensor:
+    """Change in one step along the last dim; NaN where a neighbour is missing.
+
+    Central: half the difference of the two neighbours. Backward: the difference to the one before.
+    """
+    if kind == "central":
+        return pad((value[..., 2:] - value[..., :-2]) / 2, (1, 1), value=torch.nan)
+    return pad(value[..., 1:] - value[..., :-1], (1, 0), value=torch.nan)
 
 
-def _kinematics(tracks: _Tracks) -> dict[str, Tensor]:
-    """Speeds and accelerations of the evaluated agents (SPEC section 2)."""
-    position, heading = tracks.position[:, tracks.ego], tracks.heading[:, tracks.ego]
-    speed = _speed(position)
-    turn = _turn(heading)
-    values = {
-        "linear_speed": speed,
-        "linear_acceleration": _central_difference(speed) / STEP_SECONDS,
-        "angular_speed": turn / STEP_SECONDS,
-        "angular_acceleration": _turn(turn) / STEP_SECONDS**2,
-    }
-    return {name: value[..., _CONTEXT:] for name, value in values.items()}
+def _turn(angle: Tensor, kind: Differences) -> Tensor:
+    """Change of an angle in one step, wrapped over the steps that it spans [rad]."""
+    steps = 2 if kind == "central" else 1
+    return wrap_angle(steps * _difference(angle, kind)) / steps
 
 
-def _speed(position: Tensor) -> Tensor:
+def _speed(position: Tensor, kind: Differences) -> Tensor:
     """Speed from positions in two or three dims: ``[..., L, D]`` -> ``[..., L]`` [m/s]."""
-    step = _central_difference(position.transpose(-1, -2))
+    step = _difference(position.transpose(-1, -2), kind)
     return step.square().sum(-2).sqrt() / STEP_SECONDS
 
 
-def _turn(angle: Tensor) -> Tensor:
-    """Central difference of an angle, wrapped over the two steps that it spans [rad]."""
-    return wrap_angle(2 * _central_difference(angle)) / 2
+def _kinematics(tracks: _Tracks, config: RealismConfig) -> dict[str, Tensor]:
+    """Speeds and accelerations of the evaluated agents (SPEC section 2)."""
+    position, heading = tracks.position[:, tracks.ego], tracks.heading[:, tracks.ego]
+    if Quirk.INVALID_AT_ORIGIN not in config.quirks:
+        valid = tracks.valid[:, tracks.ego]
+        position, heading = position.where(valid[..., None], torch.nan), heading.where(valid, torch.nan)
+    kind = config.differences
+    speed, turn = _speed(position, kind), _turn(heading, kind)
+    if kind == "central":
+        angular_acceleration = _turn(turn, kind) / STEP_SECONDS**2
+    else:  # the code of 2023 wraps a difference of speeds as if it were one of angles
+        angular_acceleration = _turn(turn / STEP_SECONDS, kind) / STEP_SECONDS
+    values = {
+        "linear_speed": speed,
+        "linear_acceleration": _difference(speed, kind) / STEP_SECONDS,
+        "angular_speed": turn / STEP_SECONDS,
+        "angular_acceleration": angular_acceleration,
+    }
+    return {name: value[..., _CONTEXT:] for name, value in values.items()}
 
 
 def _nearest_object(tracks: _Tracks, rounding: float) -> Tensor:
@@ -213,16 +235,18 @@ def _nearest_object(tracks: _Tracks, rounding: float) -> Tensor:
     return nearest_box_distance(boxes, valid, tracks.ego, rounding).transpose(1, 2)
 
 
-def _time_to_collision(tracks: _Tracks) -> Tensor:
+def _time_to_collision(tracks: _Tracks, config: RealismConfig) -> Tensor:
     """Time until evaluated agents reach their leaders at present speeds (SPEC section 3.2) -> ``[C, E, 80]`` [s]."""
-    speed = _speed(tracks.position[..., :2])[..., _CONTEXT:]
+    speed = _speed(tracks.position[..., :2], config.differences)[..., _CONTEXT:]
     position, heading = tracks.position[:, :, _CONTEXT:, :2], tracks.heading[:, :, _CONTEXT:]
     valid = tracks.valid[:, :, _CONTEXT:]
     length, width = tracks.extent[:, 0, None], tracks.extent[:, 1, None]
     result = []
     for ego in tracks.ego.tolist():
-        # not wrapped in the official code: headings of +3.1 and -3.1 count as 6.2 rad apart
-        turn = (heading - heading[:, ego, None]).abs()
+        turn = heading - heading[:, ego, None]
+        if Quirk.UNWRAPPED_TURN not in config.quirks:
+            turn = wrap_angle(turn)
+        turn = turn.abs()
         cos, sin = turn.cos().abs(), turn.sin().abs()
         ahead, aside = rotate(position - position[:, ego, None], -heading[:, ego, None]).unbind(-1)
         gap = ahead - length[ego] / 2 - (length * cos + width * sin) / 2
@@ -246,11 +270,9 @@ def _road_edge(tracks: _Tracks, edges: RoadEdges) -> Tensor:
     return result
 
 
-def _displacement(scene: Scene, simulated: Tensor, ego: Tensor) -> Tensor:
-    """Mean distance from the log (SPEC section 5) -> ``[R, E]`` [m].
-
-    The official mean runs over all 91 steps, although the eleven of history cannot differ.
-    """
+def _displacement(scene: Scene, simulated: Tensor, ego: Tensor, with_history: bool) -> Tensor:
+    """Mean distance from the log (SPEC section 5) -> ``[R, E]`` [m]; NaN where the log has no step."""
     position, valid = scene.agents.position[ego], scene.agents.valid[ego]
     error = (simulated[:, ego, :, :3] - position[:, -HORIZON:]).norm(dim=-1)
-    return (error * valid[:, -HORIZON:]).sum(-1) / valid.sum(-1)
+    steps = valid if with_history else valid[:, -HORIZON:]
+    return (error * valid[:, -HORIZON:]).sum(-1) / steps.sum(-1)

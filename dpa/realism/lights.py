@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from dpa.realism.quirks import Quirk
 from envs.scene import CURRENT_STEP, LightState, MapKind, Scene
 
 _RED = (LightState.ARROW_STOP, LightState.STOP)
@@ -28,7 +30,7 @@ class _Lanes:
     owner: Tensor
 
 
-def red_light_violation(scene: Scene, position: Tensor, valid: Tensor) -> Tensor:
+def red_light_violation(scene: Scene, position: Tensor, valid: Tensor, quirks: Set[Quirk] = frozenset(Quirk)) -> Tensor:
     """Steps at which agents pass the stop point of the lane that they are on while its light is red.
 
     Args:
@@ -36,34 +38,38 @@ def red_light_violation(scene: Scene, position: Tensor, valid: Tensor) -> Tensor
             and lights.
         position: ``[C, E, 81, 2]``, centres from the current step on [m].
         valid: ``[C, E, 81]`` bool.
+        quirks: of the official code that are kept.
 
     Returns:
         ``[C, E, 80]`` bool, for the steps after the current one.
     """
     violation = torch.zeros_like(valid[..., 1:])
-    lanes = _surface_lanes(scene)
+    lanes = _surface_lanes(scene, Quirk.LANES_TO_ORIGIN in quirks)
     if lanes is None:
         return violation
+    sign = 1.0 if Quirk.PLUS_FOR_MINUS in quirks else -1.0
     lane_ids, states, stops = _signals(scene)
     passed, lane = [], []
     for lane_id, state, stop in zip(lane_ids, states, stops, strict=True):
         own = lanes.owner == lane_id
         if own.any():
             red = torch.isin(state, torch.tensor(_RED, device=state.device))[1:]
-            passed.append(_passes(position, stop, lanes.start[own], lanes.delta[own]) & red & valid[..., 1:])
+            if Quirk.ABSENT_STOP_AT_ORIGIN not in quirks:
+                red = red & (state != LightState.ABSENT)[:-1]
+            passed.append(_passes(position, stop, lanes.start[own], lanes.delta[own], sign) & red & valid[..., 1:])
             lane.append(lane_id)
     if not passed:
         return violation
     # The lane that an agent is on is costly to find and matters only where it passes some red light.
     red_pass = torch.stack(passed, -1)
     where = red_pass.any(-1)
-    current = _current_lane(position[..., 1:, :][where], lanes)
+    current = _current_lane(position[..., 1:, :][where], lanes, sign)
     violation[where] = (red_pass[where] & (current[:, None] == torch.stack(lane))).any(-1)
     return violation
 
 
-def _surface_lanes(scene: Scene) -> _Lanes | None:
-    """Lanes as the official code sees them, which pads each to the longest one with zeros.
+def _surface_lanes(scene: Scene, to_origin: bool) -> _Lanes | None:
+    """Segments of the lanes; the official code pads each lane to the longest one with zeros.
 
     Every shorter lane so gains a segment from its last point to the origin of the world.
     """
@@ -76,7 +82,7 @@ def _surface_lanes(scene: Scene) -> _Lanes | None:
     lines = []
     for start, count in zip(road.start[index].tolist(), road.count[index].tolist(), strict=True):
         points = road.points[start : start + count, :2]
-        lines.append(torch.cat((points, world_origin)) if count < longest else points)
+        lines.append(torch.cat((points, world_origin)) if to_origin and count < longest else points)
     segments = torch.tensor([len(line) - 1 for line in lines], device=index.device)
     return _Lanes(
         start=torch.cat([line[:-1] for line in lines]),
@@ -91,7 +97,7 @@ def _signals(scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
     return lights.lane_id, lights.state[:, CURRENT_STEP:], lights.stop_point[:, CURRENT_STEP:, :2]
 
 
-def _passes(position: Tensor, stop: Tensor, start: Tensor, delta: Tensor) -> Tensor:
+def _passes(position: Tensor, stop: Tensor, start: Tensor, delta: Tensor, sign: float) -> Tensor:
     """Agents go from behind the stop point of one lane to beyond it.
 
     Args:
@@ -99,31 +105,32 @@ def _passes(position: Tensor, stop: Tensor, start: Tensor, delta: Tensor) -> Ten
         stop: ``[81, 2]``, stop point of the lane.
         start: ``[W', 2]``, segments of the lane.
         delta: ``[W', 2]``.
+        sign: see :func:`_distance`.
 
     Returns:
         ``[C, E, 80]`` bool.
     """
-    segment = _odd_distance(stop, start, delta).argmin(-1)
+    segment = _distance(stop, start, delta, sign).argmin(-1)
     start, delta = start[segment], delta[segment]
     at_stop, at_agent = _along(stop, start, delta), _along(position, start, delta)
     return (at_agent < at_stop)[..., :-1] & (at_agent > at_stop)[..., 1:]
 
 
-def _current_lane(points: Tensor, lanes: _Lanes) -> Tensor:
+def _current_lane(points: Tensor, lanes: _Lanes, sign: float) -> Tensor:
     """``feature_id`` of the lane that each point is on, the first in map order on ties: ``[n, 2]`` -> ``[n]``."""
     rows = max(1, _DISTANCES_PER_CHUNK // len(lanes.start))
-    nearest = [_odd_distance(part, lanes.start, lanes.delta).argmin(-1) for part in points.split(rows)]
+    nearest = [_distance(part, lanes.start, lanes.delta, sign).argmin(-1) for part in points.split(rows)]
     return lanes.owner[torch.cat(nearest)]
 
 
-def _odd_distance(points: Tensor, start: Tensor, delta: Tensor) -> Tensor:
-    """What the official code takes for the distance from points to segments: ``[n, 2]``, ``[W, 2]`` -> ``[n, W]``.
+def _distance(points: Tensor, start: Tensor, delta: Tensor, sign: float) -> Tensor:
+    """Distance from points to segments with ``sign=-1``: ``[n, 2]``, ``[W, 2]`` -> ``[n, W]``.
 
-    It adds the projection where it should subtract it.
+    The official code adds the projection where it should subtract it, which is ``sign=1``.
     """
     points = points[:, None]
     t = _along(points, start, delta).clamp(0, 1)
-    return (points - start + t[..., None] * delta).norm(dim=-1)
+    return (points - start + sign * t[..., None] * delta).norm(dim=-1)
 
 
 def _along(points: Tensor, start: Tensor, delta: Tensor) -> Tensor:

@@ -9,9 +9,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dpa.realism.config import BUCKETS, RealismConfig
-from dpa.realism.estimators import histogram_log_likelihood, indicator_log_likelihood
+from dpa.realism.config import BUCKETS, Differences, RealismConfig
+from dpa.realism.estimators import indicator_log_likelihood, log_likelihood
 from dpa.realism.features import HORIZON, Features, measure
+from dpa.realism.quirks import Quirk
 from envs.scene import Scene
 
 _EVENTS = {
@@ -81,7 +82,12 @@ class RealismResult:
 
 @torch.no_grad()
 def realism(
-    scene: Scene, simulated: Tensor, config: str | Path | RealismConfig = "2024", *, features: bool = False
+    scene: Scene,
+    simulated: Tensor,
+    config: str | Path | RealismConfig = "2024",
+    *,
+    quirks: bool = True,
+    features: bool = False,
 ) -> RealismResult:
     """Score rollouts of one scene.
 
@@ -93,6 +99,8 @@ def realism(
         simulated: ``[R, A, 80, 4]``, x, y, z, heading of steps 11 to 90 in the scene's frame, where A are the agents
             with ``scene.agents.present``, in that order. The standard is R = 32.
         config: the year, a path or a :class:`RealismConfig`.
+        quirks: ``False`` leaves out all that looks like an accident of the official code (:mod:`dpa.realism.quirks`):
+            a cleaner metric, whose numbers compare with no others.
         features: also return what was measured.
 
     Raises:
@@ -107,15 +115,16 @@ def realism(
         (0.0, 0.0)
     """
     config = config if isinstance(config, RealismConfig) else RealismConfig.load(config)
+    config = config if quirks else config.replace(quirks=frozenset())
     _check(scene, simulated)
     measured = measure(scene, simulated.to(scene.agents.position.dtype), config)
-    likelihood = {**_histogram_likelihoods(measured, config), **_indicator_likelihoods(measured, config)}
+    likelihood = {**_continuous_likelihoods(measured, config), **_indicator_likelihoods(measured, config)}
     weights = config.weights
     displacement = measured.displacement
     return RealismResult(
         realism=sum(weights[name] * value for name, value in likelihood.items()),
         likelihood=likelihood,
-        rate=_rates(measured),
+        rate=_rates(measured, config),
         min_ade=displacement.mean(1).min().item(),
         ade=displacement.mean().item(),
         features=measured if features else None,
@@ -179,38 +188,51 @@ def _check(scene: Scene, simulated: Tensor) -> None:
         )
 
 
-def _histogram_likelihoods(measured: Features, config: RealismConfig) -> dict[str, float]:
-    """Likelihood of each continuous feature, one mean over the valid steps of all agents."""
+def _continuous_likelihoods(measured: Features, config: RealismConfig) -> dict[str, float]:
+    """Likelihood of each continuous feature, one mean over the scored steps of all agents."""
     masks = _masks(measured, config)
     result = {}
-    for name, histogram in config.histograms.items():
-        value = measured.values[name]
-        score = histogram_log_likelihood(value[0], value[1:], histogram)
-        mask = masks[name]
+    for name, estimator in config.continuous.items():
+        value, mask = measured.values[name], masks[name]
+        score = log_likelihood(
+            value[0],
+            value[1:],
+            estimator,
+            None if Quirk.UNMASKED_SAMPLES in config.quirks else mask,
+            keep_nan=Quirk.NAN_IN_LAST_BIN in config.quirks,
+        )
         result[name] = (torch.where(mask, score, 0).sum() / mask.sum()).exp().item()
     return result
 
 
 def _masks(measured: Features, config: RealismConfig) -> dict[str, Tensor]:
     """Steps ``[E, 80]`` at which the log of each continuous feature counts."""
-    valid = measured.valid
-    speed = _both_neighbours(valid)
-    acceleration = _both_neighbours(speed)
+    scored = measured.valid[:, -HORIZON:]
+    # The official code looks for neighbours among the scored steps only, so the ends have none.
+    known = scored if Quirk.ENDS_UNSCORED in config.quirks else measured.valid
+    speed = _with_neighbours(known, config.differences)
+    acceleration = _with_neighbours(speed, config.differences)[:, -HORIZON:]
+    ttc = scored & measured.vehicle[:, None] if config.ttc_vehicle_only else scored
+    if Quirk.LAST_TTC not in config.quirks and config.differences == "central":
+        ttc = ttc & (torch.arange(HORIZON, device=ttc.device) < HORIZON - 1)
     return {
-        "linear_speed": speed,
-        "angular_speed": speed,
+        "linear_speed": speed[:, -HORIZON:],
+        "angular_speed": speed[:, -HORIZON:],
         "linear_acceleration": acceleration,
         "angular_acceleration": acceleration,
-        "distance_to_nearest_object": valid,
-        "distance_to_road_edge": valid,
-        "time_to_collision": valid & measured.vehicle[:, None] if config.ttc_vehicle_only else valid,
+        "distance_to_nearest_object": scored,
+        "distance_to_road_edge": scored,
+        "time_to_collision": ttc,
     }
 
 
-def _both_neighbours(valid: Tensor) -> Tensor:
-    """Steps whose central difference is valid (SPEC section 2.3): ``[E, T]`` -> ``[E, T]``."""
+def _with_neighbours(valid: Tensor, differences: Differences) -> Tensor:
+    """Steps whose difference is known (SPEC sections 2.3 and 8): ``[E, T]`` -> ``[E, T]``."""
     result = torch.zeros_like(valid)
-    result[:, 1:-1] = valid[:, :-2] & valid[:, 2:]
+    if differences == "central":
+        result[:, 1:-1] = valid[:, :-2] & valid[:, 2:]
+    else:
+        result[:, 1:] = valid[:, :-1] & valid[:, 1:]
     return result
 
 
@@ -220,24 +242,27 @@ def _indicator_likelihoods(measured: Features, config: RealismConfig) -> dict[st
     for name, indicator in config.indicators.items():
         if _EVENTS[name] not in measured.values:
             continue
-        happened = _happened(measured, _EVENTS[name])
+        happened = _happened(measured, _EVENTS[name], config)
         if name == "traffic_light_violation":
             happened = happened & measured.vehicle
         result[name] = indicator_log_likelihood(happened[0], happened[1:], indicator).mean().exp().item()
     return result
 
 
-def _rates(measured: Features) -> dict[str, float]:
+def _rates(measured: Features, config: RealismConfig) -> dict[str, float]:
     return {
-        name: _happened(measured, event)[1:].float().mean().item()
+        name: _happened(measured, event, config)[1:].float().mean().item()
         for name, event in _RATES.items()
         if event in measured.values
     }
 
 
-def _happened(measured: Features, event: str) -> Tensor:
+def _happened(measured: Features, event: str, config: RealismConfig) -> Tensor:
     """``[C, E]`` bool: the event happened at some step at which the agent is there in the log."""
-    return (measured.values[event] & measured.valid).any(-1)
+    happened = measured.values[event]
+    if Quirk.GHOSTS not in config.quirks:
+        happened = happened & measured.valid[:, -HORIZON:]
+    return happened.any(-1)
 
 
 def _weighted_mean(likelihood: Mapping[str, float], weights: Mapping[str, float], names: Sequence[str]) -> float:

@@ -37,6 +37,9 @@ class RoadEdges:
         delta: ``[W, 3]``, from its first to its second point [m].
         previous: ``[W]`` int64, the segment that ends where this one starts; -1 where there is none.
         following: ``[W]`` int64, the segment that starts where this one ends; -1 where there is none.
+        line: ``[W]`` int64, the polyline of each segment.
+        height_stretch: how much a metre of height counts when the nearest segment is chosen; 0 is a flat world.
+        points_at_zero: a polyline whose nearest segment has no length is at distance 0, however far (code of 2023).
 
     Examples:
         >>> edges = RoadEdges.from_polylines([torch.tensor([[0.0, 0, 0], [10, 0, 0], [10, 10, 0]])])
@@ -48,16 +51,27 @@ class RoadEdges:
     delta: Tensor
     previous: Tensor
     following: Tensor
+    line: Tensor
+    height_stretch: float = HEIGHT_STRETCH
+    points_at_zero: bool = False
 
     @classmethod
-    def from_polylines(cls, lines: Sequence[Tensor]) -> RoadEdges:
+    def from_polylines(
+        cls,
+        lines: Sequence[Tensor],
+        *,
+        every_ring: bool = False,
+        height_stretch: float = HEIGHT_STRETCH,
+        points_at_zero: bool = False,
+    ) -> RoadEdges:
         """Flatten polylines; those of fewer than two points have no segment and are left out.
-
-        A ring is closed only if no polyline of the map has more points: the official code pads polylines to the
-        longest one, and its wrap-around meets the padding of all the others.
 
         Args:
             lines: each ``[n, 3]``, the drivable side on the left, as :func:`envs.scene.polylines` gives them.
+            every_ring: close every ring. By default one is closed only if no polyline of the map has more points: the
+                official code pads polylines to the longest one, and its wrap-around meets the padding of all others.
+            height_stretch: see the class.
+            points_at_zero: see the class.
 
         Raises:
             ValueError: no polyline has two points.
@@ -73,7 +87,7 @@ class RoadEdges:
         for line in lines:
             last = first + len(line) - 2
             before, after = torch.arange(first - 1, last), torch.arange(first + 1, last + 2)
-            ring = len(line) == longest and float((line[0] - line[-1]).square().sum()) < CYCLE_GAP**2
+            ring = (every_ring or len(line) == longest) and float((line[0] - line[-1]).square().sum()) < CYCLE_GAP**2
             before[0], after[-1] = (last, first) if ring else (_NO_SEGMENT, _NO_SEGMENT)
             previous.append(before)
             following.append(after)
@@ -84,6 +98,9 @@ class RoadEdges:
             delta=torch.cat([line[1:] - line[:-1] for line in lines]),
             previous=torch.cat(previous).to(device),
             following=torch.cat(following).to(device),
+            line=torch.arange(len(lines)).repeat_interleave(torch.tensor([len(line) - 1 for line in lines])).to(device),
+            height_stretch=height_stretch,
+            points_at_zero=points_at_zero,
         )
 
     def signed_distance(self, points: Tensor) -> Tensor:
@@ -105,7 +122,10 @@ class RoadEdges:
         segment = self._nearest_segment(flat)
         _, residual = self._project(flat, segment)
         distance = residual[0].square().add_(residual[1].square()).sqrt_()
-        return (self._side(flat, segment) * distance).view(points.shape[:-1])
+        signed = self._side(flat, segment) * distance
+        if self.points_at_zero:
+            signed = torch.where(self._beside_a_point(flat), 0, signed)
+        return signed.view(points.shape[:-1])
 
     def box_offroad_distance(self, position: Tensor, heading: Tensor, extent: Tensor) -> Tensor:
         """Signed distance of the bottom corner that is farthest off the road.
@@ -151,7 +171,7 @@ class RoadEdges:
     def _stretched_distance(self, points: Tensor, segment: Tensor) -> Tensor:
         """Distance that chooses the nearest segment: ``[n, 3]``, ``[n, W']`` -> ``[n, W']``."""
         _, (x, y, z) = self._project(points, segment)
-        z = HEIGHT_STRETCH * z
+        z = self.height_stretch * z
         # Segments of one map often tie but for the last bit. The float32 square root of torch is not rounded
         # correctly, which breaks such ties at random; by way of float64 it is.
         return (x * x + y * y + z * z).double().sqrt_().float()
@@ -175,6 +195,16 @@ class RoadEdges:
         after = (t > 1) & (following != _NO_SEGMENT)
         side = torch.where(before, with_neighbour(previous, previous, segment), own)
         return torch.where(after, with_neighbour(following, segment, following), side)
+
+    def _beside_a_point(self, points: Tensor) -> Tensor:
+        """Queries to which the nearest segment of some polyline has no length, and so no side: ``[n, 3]`` -> ``[n]``."""
+        hit = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+        degenerate = (self.delta[:, :2] == 0).all(-1)
+        for line in self.line[degenerate].unique():
+            own = (self.line == line).nonzero()[:, 0]
+            nearest = self._stretched_distance(points, own.expand(len(points), -1)).argmin(1)
+            hit |= degenerate[own[nearest]]
+        return hit
 
     def _own_side(self, points: Tensor, segment: Tensor) -> Tensor:
         return torch.sign(_cross(points - self.start[segment], self.delta[segment]))
@@ -214,7 +244,7 @@ class RoadEdges:
         for row, table, real in candidates.tables(boxes.parent):
             distance = self._stretched_distance(boxes.centre[row], table)
             rise = torch.minimum(slope[table] * radius[row, None], self.delta[:, 2].abs()[table])
-            slack = torch.hypot(radius[row, None], HEIGHT_STRETCH * (half_z[row, None] + rise))
+            slack = torch.hypot(radius[row, None], self.height_stretch * (half_z[row, None] + rise))
             reach = (distance + slack).amin(1, keepdim=True) * (1 + _MARGIN) + margin
             keep = real & (distance - slack <= reach)
             parts.append((row, keep.sum(1), table[keep]))

@@ -11,10 +11,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dpa.realism import Quirk, RealismConfig
 from envs.scene import CURRENT_STEP, LOG_STEPS, Agents, Lights, LightState, MapKind, RoadMap, Scene
 
 SHIPPED = Path(__file__).resolve().parents[2] / "data" / "realism"
 """Scenes of our own that were made to hit corner cases, with the values of the official code."""
+
+
+CODES = {"code2023": "2023", "code2023dec": "2023", "code2024": "2024", "code2025": "2025"}
+"""Year of each version of the official code; "code2023" is its first one (pip 1.6.0), with the ghosts."""
+
+
+def golden_config(code: str, year: str) -> RealismConfig:
+    """Ranges and weights of one year with the code of another."""
+    weights, config = RealismConfig.load(year), RealismConfig.load(CODES[code])
+    quirks = config.quirks | ({Quirk.GHOSTS} if code == "code2023" else set())
+    return config.replace(continuous=weights.continuous, indicators=weights.indicators, quirks=quirks)
 
 
 @dataclass(frozen=True)

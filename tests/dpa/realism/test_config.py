@@ -6,13 +6,21 @@ from pathlib import Path
 
 import pytest
 
-from dpa.realism import RealismConfig
+from dpa.realism import Kernel, RealismConfig
 from dpa.realism.config import FOLDER
 
 
-@pytest.mark.parametrize("year", ["2024", "2025"])
-def test_weights_of_each_year_sum_to_one(year: str) -> None:
-    assert sum(RealismConfig.load(year).weights.values()) == pytest.approx(1.0)
+@pytest.mark.parametrize(("year", "total"), [("2023", 0.99), ("2024", 1.0), ("2025", 1.0)])
+def test_weights_of_each_year_sum_to_what_the_challenge_says(year: str, total: float) -> None:
+    assert sum(RealismConfig.load(year).weights.values()) == pytest.approx(total)
+
+
+def test_a_kernel_density_may_take_the_place_of_a_histogram(tmp_path: Path) -> None:
+    text = (FOLDER / "2025.yaml").read_text()
+    line = next(line for line in text.splitlines() if line.strip().startswith("linear_speed:"))
+    path = tmp_path / "mine.yaml"
+    path.write_text(text.replace(line, "  linear_speed: {bandwidth: 0.5, weight: 0.05, pooled: true}"))
+    assert RealismConfig.load(path).continuous["linear_speed"] == Kernel(bandwidth=0.5, weight=0.05, pooled=True)
 
 
 def test_a_path_is_read_like_a_name(tmp_path: Path) -> None:
@@ -30,10 +38,16 @@ def test_an_unknown_name_is_refused_with_the_known_ones() -> None:
     ("old", "new", "message"),
     [
         ("corner_rounding", "corner_roundness", r"unknown keys \['corner_roundness'\] and lacks \['corner_rounding'\]"),
-        ("linear_speed:", "speed:", r"histograms has unknown keys \['speed'\]"),
+        ("linear_speed:", "speed:", r"continuous has unknown keys \['speed'\]"),
         ("bins: 10", "bins: ten", r"bins must be of type int, got 'ten'"),
         ("bins: 10", "bins: 10, colour: 3", r"linear_speed has unknown keys \['colour'\]"),
         ("traffic_lights: true", "traffic_lights: false", r"weight 0\.05.*traffic_lights: false"),
+        (
+            "differences: central",
+            "differences: forward",
+            r"differences must be one of central, backward, got",
+        ),
+        ("last_ttc", "first_ttc", r"quirks must be one of .*last_ttc.*, got 'first_ttc'"),
         ("traffic_lights: true", "traffic_lights: 1", r"traffic_lights must be of type bool, got 1"),
     ],
 )
