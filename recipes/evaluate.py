@@ -5,7 +5,8 @@ python -m recipes.evaluate policy=runs/pretrain/policy.pt decoding.top_p=0.9 jso
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from tensordict import TensorDictBase
 
 from dpa.ranking import PreferenceDistance
 from dpa.realism import RealismResult, mean_result, realism
+from dpa.realism.submission import SubmissionWriter, plan_submission
 from dpa.rollout import Decoding, collect_groups, lifted, simulated_poses
 from envs import keys
 from envs.progress import progress
@@ -43,7 +45,15 @@ SCENE_FIGURES = (
 """Figures of every scene, averaged over scenes."""
 
 
-def evaluate(cfg: DictConfig, scenes: SceneStore, policy: Path, top_p: float, seed: int, path: Path) -> dict[str, Any]:
+def evaluate(
+    cfg: DictConfig,
+    scenes: SceneStore,
+    policy: Path,
+    top_p: float,
+    seed: int,
+    path: Path,
+    open_submission: Callable[[Sequence[str], Mapping[str, Any]], SubmissionWriter] | None = None,
+) -> dict[str, Any]:
     """Score one policy on some scenes; a finished result of the same options is read back, an unfinished one goes on.
 
     Args:
@@ -53,6 +63,7 @@ def evaluate(cfg: DictConfig, scenes: SceneStore, policy: Path, top_p: float, se
         top_p: nucleus of the sampling.
         seed: of the sampling.
         path: JSON to write.
+        open_submission: where the rollouts go as well, from :func:`~dpa.realism.submission.plan_submission`.
 
     Returns:
         ``options``, ``mean`` (each figure of :data:`SCENE_FIGURES`), ``likelihood`` (of each realism feature),
@@ -69,28 +80,33 @@ def evaluate(cfg: DictConfig, scenes: SceneStore, policy: Path, top_p: float, se
         "seed": seed,
     }
     done = finished(path, decided_by)
-    if done is not None:
+    submission = None if open_submission is None else open_submission(scenes.scene_ids, decided_by)
+    if done is not None and (submission is None or submission.finished):
         return done
     distance = build(PreferenceDistance, cfg.collection.ranking, "collection.ranking")
     partial = PartialResult(path, decided_by)
     scored = partial.read()
-    bar = progress(total=len(scenes), description=f"evaluate top-p {top_p:g}", initial=len(scored), unit="scene")
-    with bar:
+    # A scene is done once it is scored and, where a submission is written, in there as well.
+    ready = frozenset(scored) if submission is None else submission.done & scored.keys()
+    bar = progress(total=len(scenes), description=f"evaluate top-p {top_p:g}", initial=len(ready), unit="scene")
+    with bar, submission or nullcontext():
         for batch in collect_groups(
             scenes,
             model,
             range(len(scenes)),
             num_rollouts=options.num_rollouts,
-            done=frozenset(scored),
+            done=ready,
             decoding=Decoding(top_p, options.temperature),
             options=context,
             seed=seed,
             max_rows=options.max_rows,
             device=cfg.device,
         ):
-            fresh = score_group(batch, scenes, distance, options, bar.update)
+            fresh = score_group(batch, scenes, distance, options, bar.update, submission)
             partial.add(fresh)
             scored |= fresh
+        if submission is not None:
+            submission.finish()
     content = {"options": decided_by, **summarise([scored[i] for i in range(len(scenes))], scenes.scene_ids)}
     write_json(path, content)
     partial.remove()
@@ -103,6 +119,7 @@ def score_group(
     distance: PreferenceDistance,
     options: DictConfig,
     tick: Callable[[], object],
+    submission: SubmissionWriter | None = None,
 ) -> dict[int, dict[str, Any]]:
     """Score the rollouts of a group of scenes.
 
@@ -112,6 +129,7 @@ def score_group(
         distance: how far rollouts are from the log.
         options: the section ``evaluation``.
         tick: called after each scene.
+        submission: where the rollouts go as well.
 
     Returns:
         For each scene by index, the :class:`~dpa.realism.RealismResult` as plain numbers and figures of our own.
@@ -122,12 +140,15 @@ def score_group(
     for row, index in enumerate(batch[keys.SCENE][:: options.num_rollouts, 0].tolist()):
         scene = scenes[index]
         trajectories = lifted(scene, poses[row])
-        ranking = distance(scene, trajectories, controlled[row, : trajectories.shape[1]])
+        moved = controlled[row, : trajectories.shape[1]]
+        ranking = distance(scene, trajectories, moved)
         scored[index] = {
             "result": asdict(realism(scene, trajectories, options.metric)),
             "preference_distance": ranking.distance.mean().item(),
             "standing_moved": standing_moved(scene, trajectories),
         }
+        if submission is not None:
+            submission.add(index, scene, trajectories, moved)
         tick()
     return scored
 
@@ -171,8 +192,12 @@ def _mean(values: list[float | None]) -> float | None:
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.evaluate``."""
+    plan = None
+    if cfg.submission is not None:
+        rollouts = cfg.evaluation.num_rollouts
+        plan = plan_submission(cfg.submission, cfg.submission_metadata, rollouts, cfg.submission_shards)
     scenes = open_splits(cfg.scenes)[cfg.split]
-    result = evaluate(cfg, scenes, Path(cfg.policy), cfg.decoding.top_p, cfg.seed, Path(cfg.json))
+    result = evaluate(cfg, scenes, Path(cfg.policy), cfg.decoding.top_p, cfg.seed, Path(cfg.json), plan)
     width = max(map(len, SCENE_FIGURES))
     for name, value in result["mean"].items():
         print(f"{name:{width}}  {'–' if value is None else format(value, '.4f')}")

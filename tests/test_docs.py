@@ -19,6 +19,7 @@ from envs.convert import _parser as convert_parser
 from envs.sources import SOURCES
 from envs.sources.sumo import parse, units
 from recipes.align import LOSSES
+from recipes.benchmark import make_parser as benchmark_parser
 from recipes.models import TOKENIZERS
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -122,7 +123,17 @@ def extra_configurations(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("command", [c for c in COMMANDS if c.startswith("recipes.")])
+BENCHMARKS = [command for command in COMMANDS if command.startswith("recipes.benchmark ")]
+
+
+@pytest.mark.parametrize("command", BENCHMARKS)
+def test_a_benchmark_takes_the_options_that_a_command_gives(command: str) -> None:
+    assert benchmark_parser().parse_args(shlex.split(command)[1:]).part in command
+
+
+@pytest.mark.parametrize(
+    "command", [c for c in COMMANDS if c.startswith("recipes.") and not c.startswith("recipes.benchmark")]
+)
 def test_a_recipe_takes_the_options_that_a_command_gives(command: str, extra_configurations: Path) -> None:
     module, *arguments = shlex.split(command)
     overrides, config = [], module.partition(".")[2]

@@ -79,6 +79,25 @@ class RealismResult:
             **{f"{name}_likelihood": value for name, value in self.likelihood.items()},
         }
 
+    def official(self) -> dict[str, dict[str, float]]:
+        """All figures under their official names: ``metrics`` of the metric, ``buckets`` of the challenge's ranking."""
+        rates = {f"simulated_{name}": value for name, value in self.rate.items()}
+        return {
+            "metrics": {
+                "metametric": self.realism,
+                "average_displacement_error": self.ade,
+                "min_average_displacement_error": self.min_ade,
+                **{f"{name}_likelihood": value for name, value in self.likelihood.items()},
+                **rates,
+            },
+            "buckets": {
+                "realism_meta_metric": self.realism,
+                **{f"{name}_metrics": getattr(self, name) for name in BUCKETS},
+                "min_ade": self.min_ade,
+                **rates,
+            },
+        }
+
 
 @torch.no_grad()
 def realism(

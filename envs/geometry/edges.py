@@ -197,7 +197,7 @@ class RoadEdges:
         return torch.where(after, with_neighbour(following, segment, following), side)
 
     def _beside_a_point(self, points: Tensor) -> Tensor:
-        """Queries to which the nearest segment of some polyline has no length, and so no side: ``[n, 3]`` -> ``[n]``."""
+        """Queries whose nearest segment of some polyline has no length, and so no side: ``[n, 3]`` -> ``[n]``."""
         hit = torch.zeros(len(points), dtype=torch.bool, device=points.device)
         degenerate = (self.delta[:, :2] == 0).all(-1)
         for line in self.line[degenerate].unique():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +18,7 @@ from envs.render import View, box_corners, fit_view, pose_tracks, render_frame, 
 from envs.render import __main__ as command_line
 from envs.render.picture import legend_handles
 from envs.scene import CURRENT_STEP, LOG_STEPS, AgentKind, Scene
-from envs.shards import file_digest, write_shard
 from envs.sources.synthetic import red_light, straight_road, two_cars_head_on
-from envs.store import Manifest, write_manifest
 
 HERE = View(0.0, 0.0, 50.0)
 PIXELS = 500
@@ -165,14 +164,9 @@ def test_a_gif_keeps_the_colour_of_a_class_that_is_a_few_pixels_large(tmp_path: 
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Path:
+def store(tmp_path: Path, write_store: Callable) -> Path:
     """A store with the scenes ``straight_road`` and ``two_cars_head_on``."""
-    folder = tmp_path / "store"
-    folder.mkdir()
-    write_shard(folder / "00000", [straight_road(1), two_cars_head_on()], [("made", 0), ("made", 1)])
-    shards = [{"name": "00000", "scenes": 2, "sha256": file_digest(folder / "00000" / "shard.json")}]
-    write_manifest(folder, Manifest("made", {}, "", complete=True, shards=shards))
-    return folder
+    return write_store(tmp_path / "store", [straight_road(1), two_cars_head_on()])
 
 
 def test_the_command_finds_a_scene_by_id_and_by_index(store: Path, tmp_path: Path) -> None:

@@ -19,10 +19,7 @@ from unittest import mock
 import pytest
 import torch
 
-from envs.scene import Scene
-from envs.shards import file_digest, write_shard
 from envs.sources.synthetic import straight_road
-from envs.store import Manifest, write_manifest
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 TINY = [
@@ -66,18 +63,8 @@ class Outcome(NamedTuple):
     err: str
 
 
-def write_store(folder: Path, scenes: list[Scene]) -> Path:
-    """A store of one shard."""
-    folder.mkdir(parents=True)
-    write_shard(folder / "00000", scenes, [("made", row) for row in range(len(scenes))])
-    digest = file_digest(folder / "00000" / "shard.json")
-    shards = [{"name": "00000", "scenes": len(scenes), "sha256": digest}]
-    write_manifest(folder, Manifest("made", {}, "", complete=True, shards=shards))
-    return folder
-
-
 @pytest.fixture(scope="session")
-def stores(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def stores(tmp_path_factory: pytest.TempPathFactory, write_store: Callable) -> Path:
     """A folder with the stores ``train``, ``eval`` and ``other``: roads with a few cars that change speed."""
     folder = tmp_path_factory.mktemp("scenes")
     for name, first, count in (("train", 0, 8), ("eval", 100, 3), ("other", 200, 8)):

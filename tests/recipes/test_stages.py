@@ -15,6 +15,8 @@ from omegaconf import OmegaConf
 from dpa.losses import ContrastivePreferenceLoss, token_network
 from dpa.policy import MotionLM, make_context
 from dpa.preferences import PreferenceStore
+from dpa.realism.score import score
+from dpa.realism.submission import validate
 from dpa.tokens import VerletTokenizer
 from dpa.training.checkpoint import load_policy
 from dpa.training.loggers import read_curve
@@ -311,6 +313,28 @@ def test_the_loss_of_tokenization_is_measured(run: Callable, options: Callable, 
     errors = json.loads((tmp_path / "tokens.json").read_text())["errors"]
     assert errors["vehicle all"]["position_mean"] < 0.2
     assert errors["pedestrian all"] == {"poses": 0}
+
+
+# --- submission -----------------------------------------------------------------------------------------------------
+def test_an_evaluation_writes_a_submission_that_is_valid_and_scores_the_same(
+    run: Callable, options: Callable, runs: Path, stores: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "me.yaml").write_text(
+        "{account_name: a@b.org, unique_method_name: nano, num_model_parameters: 153K, uses_lidar_data: false, "
+        "uses_camera_data: false, uses_public_model_pretraining: false, "
+        "acknowledge_complies_with_closed_loop_requirement: true}"
+    )
+    archive, result = tmp_path / "mine.tar.gz", tmp_path / "result.json"
+    command = options(
+        "evaluate", f"policy={runs / 'reference/policy.pt'}", f"json={result}", "evaluation.num_rollouts=32",
+        "evaluation.max_rows=200", f"submission={archive}", f"submission_metadata={tmp_path / 'me.yaml'}",
+    )  # fmt: skip
+    outcome = run("evaluate", *command)
+    assert outcome.status == 0, outcome.err
+    scenes = SceneStore(stores / "eval")
+    assert validate(archive, scenes) == []
+    scored, own = score(stores / "eval", archive), json.loads(result.read_text())
+    assert [scored[name].realism for name in scenes.scene_ids] == pytest.approx(own["per_scene"]["realism"], abs=1e-6)
 
 
 # --- play -----------------------------------------------------------------------------------------------------------
