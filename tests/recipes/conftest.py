@@ -50,6 +50,7 @@ SECTIONS = {
     "align": ("threads", "scenes", "alignment"),
     "evaluate": ("threads", "scenes", "collection", "evaluation"),
     "play": ("threads", "scenes"),
+    "ladder": ("threads", "scenes", "model", "evaluation"),
     "tokens": ("threads", "scenes", "model"),
     "compare": ("threads", "scenes", "model", "pretraining", "collection", "alignment", "evaluation"),
 }

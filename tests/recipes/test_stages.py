@@ -337,6 +337,26 @@ def test_an_evaluation_writes_a_submission_that_is_valid_and_scores_the_same(
     assert [scored[name].realism for name in scenes.scene_ids] == pytest.approx(own["per_scene"]["realism"], abs=1e-6)
 
 
+# --- ladder ---------------------------------------------------------------------------------------------------------
+def test_the_ladder_has_its_rungs_in_order_and_reads_them_back(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "ladder.json"
+    policies = f"policies=[{runs / 'reference/policy.pt'}]"
+    command = options("ladder", policies, f"output={tmp_path / 'ladder'}", f"json={out}", "evaluation.num_rollouts=8")
+    outcome = run("ladder", *command)
+    assert outcome.status == 0, outcome.err
+    rungs = json.loads(out.read_text())["rungs"]
+    mean = {name: sum(years["2024"]["realism"]) / 3 for name, years in rungs.items()}
+    assert list(mean) == [
+        "log", "log through tokens", "noisy log", "constant velocity", "random tokens", "untrained model", "reference"
+    ]  # fmt: skip
+    assert mean["log"] > mean["log through tokens"] > mean["random tokens"]
+    assert rungs["log"]["2024"]["min_ade"] == [0.0] * 3
+    content = out.read_text()
+    assert "log" in run("ladder", *command).out and out.read_text() == content
+
+
 # --- play -----------------------------------------------------------------------------------------------------------
 def test_rollouts_of_some_policies_make_a_page_that_plays(
     run: Callable, options: Callable, runs: Path, tmp_path: Path

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from dpa.realism import RealismResult, mean_result, realism
-from envs.scene import AgentKind, Scene, collate, select_agents
+from envs.scene import CURRENT_STEP, AgentKind, Agents, Scene, collate, select_agents
 from envs.sources.synthetic import straight_road, two_cars_head_on
 from tests.dpa.realism.golden import CODES, SHIPPED, Golden, golden_config
 
@@ -122,6 +124,29 @@ def test_padding_changes_nothing(golden_scene) -> None:
     )
     assert len(alone.agents.valid) == len(scene.agents.valid) + 3
     assert realism(alone, rollouts, "2025") == realism(scene, rollouts, "2025")
+
+
+def test_an_agent_that_is_not_there_at_the_current_step_changes_nothing(golden_scene) -> None:
+    scene, rollouts = golden_scene
+    agents = scene.agents.clone()
+    grown = {name: torch.cat((value, value[:1])) for name, value in agents.to_dict().items()}
+    grown["valid"][-1, : CURRENT_STEP + 1] = False
+    grown["position"][-1, : CURRENT_STEP + 1] = 0
+    grown["track_id"][-1], grown["sdc"][-1], grown["predict"][-1] = 10_000, False, True
+    larger = scene.clone()
+    larger.agents = Agents(**grown, batch_size=[])
+    assert realism(larger, rollouts, "2025") == realism(scene, rollouts, "2025")
+
+
+@settings(max_examples=10, deadline=None)
+@given(shift=st.tuples(*[st.integers(-20_000, 20_000)] * 2), year=st.sampled_from(["2024", "2025"]))
+def test_moving_the_world_changes_nothing_but_rounding(shift: tuple[int, int], year: str) -> None:
+    scene = straight_road(num_vehicles=3, seed=1)
+    rollouts = log_as_rollout(scene) + torch.randn(8, 1, 1, 1, generator=torch.Generator().manual_seed(0))
+    here = realism(scene, rollouts, year)
+    scene.origin = torch.tensor([*map(float, shift), 0.0], dtype=torch.float64)
+    # float32 at 20 km resolves 2 mm, which moves single speeds and accelerations to the next bin
+    assert realism(scene, rollouts, year).realism == pytest.approx(here.realism, abs=2e-2)
 
 
 def log_as_rollout(scene: Scene) -> torch.Tensor:

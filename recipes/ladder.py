@@ -1,0 +1,201 @@
+"""A ladder for sanity: what the realism metric gives to the log itself, to crude rollouts, and to models.
+
+python -m recipes.ladder scenes=gpudrive scenes.train=DIR scenes.eval=DIR policies=[runs/pretrain/policy.pt]
+
+A metric that is worth trusting puts the rungs in their order. Run the same command again to go on after a kill: rungs
+that are there are read back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import hydra
+import torch
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from dpa.policy import ContextOptions, MotionLM
+from dpa.realism import realism
+from dpa.report.statistics import summary
+from dpa.rollout import Decoding, collect_groups, lifted, simulated_poses
+from dpa.tokens import MotionTokenizer
+from dpa.training.seeding import make_generator, seed_everything
+from envs import keys
+from envs.progress import progress
+from envs.scene import CURRENT_STEP, STEP_SECONDS, Scene, SceneSource
+from recipes.cli import CONFIG, build, finished, plain, recipe, write_json
+from recipes.models import build_policy, context_options, open_policy, policy_config, weights_digest
+from recipes.play import named
+from recipes.scenes import fingerprint, open_splits
+
+Rung = Callable[[Scene, int, torch.Generator], Tensor]
+"""Scene, number of rollouts and generator -> ``[R, A, 80, 4]``."""
+NOISE_XY, NOISE_HEADING = 0.1, 0.01
+"""Standard deviation of a noisy log's drift in one step [m], [rad]; it adds up to 0.9 m and 5 degrees at the end."""
+
+
+def logged(scene: Scene, num_rollouts: int, generator: torch.Generator) -> Tensor:
+    """The log in every rollout; where it has no step, the agent stays where it was last."""
+    return _log(scene).expand(num_rollouts, -1, -1, -1)
+
+
+def noisy_log(scene: Scene, num_rollouts: int, generator: torch.Generator) -> Tensor:
+    """The log with a drift of its own in every rollout."""
+    log = _log(scene)
+    noise = torch.randn(num_rollouts, *log.shape, generator=generator).cumsum(2)
+    return log + noise * torch.tensor([NOISE_XY, NOISE_XY, 0.0, NOISE_HEADING])
+
+
+def constant_velocity(scene: Scene, num_rollouts: int, generator: torch.Generator) -> Tensor:
+    """Every agent goes straight on at its speed of the current step, in every rollout."""
+    agents, log = scene.agents, _log(scene)
+    time = STEP_SECONDS * torch.arange(1, log.shape[1] + 1)
+    now = agents.present
+    xy = agents.position[now, CURRENT_STEP, None, :2] + agents.velocity[now, CURRENT_STEP, None] * time[:, None]
+    heading = agents.heading[now, CURRENT_STEP, None, None].expand(-1, log.shape[1], 1)
+    poses = torch.cat((xy, heading), -1)
+    return lifted(scene, poses[None]).expand(num_rollouts, -1, -1, -1)
+
+
+def random_tokens(tokenizer: MotionTokenizer) -> Rung:
+    """Every token as likely as any other, at every decision."""
+
+    def roll(scene: Scene, num_rollouts: int, generator: torch.Generator) -> Tensor:
+        recent, kind = _recent(scene, tokenizer.steps), scene.agents.kind[scene.agents.present]
+        steps = _log(scene).shape[1] // tokenizer.steps
+        tokens = torch.randint(tokenizer.vocab_size, (num_rollouts, len(kind), steps), generator=generator)
+        return lifted(scene, tokenizer.decode_tracks(tokens, recent.expand(num_rollouts, -1, -1, -1), kind))
+
+    return roll
+
+
+def tokenized_log(tokenizer: MotionTokenizer) -> Rung:
+    """The log through tokens and back, in every rollout: the best that any model of these tokens could do alike."""
+
+    def roll(scene: Scene, num_rollouts: int, generator: torch.Generator) -> Tensor:
+        recent, kind = _recent(scene, tokenizer.steps), scene.agents.kind[scene.agents.present]
+        poses = _log(scene)[..., [0, 1, 3]]
+        tracks = tokenizer.encode_tracks(poses, torch.ones(poses.shape[:2], dtype=torch.bool), recent, kind)
+        return lifted(scene, tracks.poses[None]).expand(num_rollouts, -1, -1, -1)
+
+    return roll
+
+
+def _log(scene: Scene) -> Tensor:
+    """``[A, 80, 4]`` of the present agents; a step that the log lacks has the pose of the last one that it has."""
+    agents = scene.agents
+    poses = torch.cat((agents.position, agents.heading[..., None]), -1)[agents.present, CURRENT_STEP:]
+    steps = torch.arange(poses.shape[1])
+    last = torch.where(agents.valid[agents.present, CURRENT_STEP:], steps, 0).cummax(1).values
+    return poses.gather(1, last[..., None].expand_as(poses))[:, 1:]
+
+
+def _recent(scene: Scene, steps: int) -> Tensor:
+    """``[A, F + 1, 3]`` before the first decision; a step that the log lacks is taken for the current one."""
+    agents, window = scene.agents, slice(CURRENT_STEP - steps, CURRENT_STEP + 1)
+    poses = torch.cat((agents.position[..., :2], agents.heading[..., None]), -1)[agents.present, window]
+    return torch.where(agents.valid[agents.present, window, None], poses, poses[:, -1:])
+
+
+def score_rung(scenes: SceneSource, rollouts: Iterator[tuple[int, Tensor]], years: list[str], name: str) -> dict:
+    """``{year: {figure: one value per scene}}`` of one rung."""
+    found: dict[int, dict[str, dict[str, float]]] = {}
+    with progress(total=len(scenes), description=name, unit="scene") as bar:
+        for index, poses in rollouts:
+            found[index] = {year: realism(scenes[index], poses, year).as_dict() for year in years}
+            bar.update()
+    figures = ("realism", "kinematic", "interactive", "map_based", "min_ade", "collision_rate", "offroad_rate")
+    return {year: {key: [found[i][year][key] for i in sorted(found)] for key in figures} for year in years}
+
+
+def crude(scenes: SceneSource, rung: Rung, num_rollouts: int, seed: int) -> Iterator[tuple[int, Tensor]]:
+    """Rollouts of every scene by a rung that needs no model."""
+    for index in range(len(scenes)):
+        yield index, rung(scenes[index], num_rollouts, make_generator(seed, "ladder", index))
+
+
+def driven(
+    scenes: SceneSource, model: MotionLM, context: ContextOptions, cfg: DictConfig
+) -> Iterator[tuple[int, Tensor]]:
+    """Rollouts of every scene by a model."""
+    batches = collect_groups(
+        scenes,
+        model,
+        range(len(scenes)),
+        num_rollouts=cfg.evaluation.num_rollouts,
+        decoding=build(Decoding, cfg.decoding, "decoding"),
+        options=context,
+        seed=cfg.seed,
+        max_rows=cfg.evaluation.max_rows,
+        device=cfg.device,
+    )
+    for batch in batches:
+        poses = simulated_poses(batch, cfg.evaluation.num_rollouts).cpu()
+        for row, index in enumerate(batch[keys.SCENE][:: cfg.evaluation.num_rollouts, 0].tolist()):
+            yield index, lifted(scenes[index], poses[row])
+
+
+def rungs(cfg: DictConfig, scenes: SceneSource) -> Iterator[tuple[str, dict[str, Any], Iterator[tuple[int, Tensor]]]]:
+    """Name, what decides it, and rollouts of each rung, from the best to expect to the worst."""
+    count, seed = cfg.evaluation.num_rollouts, cfg.seed
+    config = policy_config(cfg.model)
+    seed_everything(seed)
+    untrained = build_policy(config)
+    made = {
+        "log": logged,
+        "log through tokens": tokenized_log(untrained.tokenizer),
+        "noisy log": noisy_log,
+        "constant velocity": constant_velocity,
+        "random tokens": random_tokens(untrained.tokenizer),
+    }
+    for name, rung in made.items():
+        yield name, {"tokenizer": plain(cfg.model.tokenizer)}, crude(scenes, rung, count, seed)
+    decoding = {"decoding": plain(cfg.decoding)}
+    models = {"untrained model": (untrained, context_options(cfg.model))}
+    for name, path in named(list(cfg.policies)).items():
+        model, context, _ = open_policy(path, cfg.device)
+        models[name] = (model, context)
+    for name, (model, context) in models.items():
+        yield name, decoding | {"policy": weights_digest(model)}, driven(scenes, model, context, cfg)
+
+
+def climb(cfg: DictConfig, scenes: SceneSource) -> dict[str, dict]:
+    """Score every rung, or read it back; ``{rung: {year: {figure: one value per scene}}}``."""
+    common = {"scenes": fingerprint(scenes), "num_rollouts": cfg.evaluation.num_rollouts, "seed": cfg.seed}
+    ladder = {}
+    for name, own, rollouts in rungs(cfg, scenes):
+        path = Path(cfg.output) / f"{name.replace(' ', '_').replace('/', '_')}.json"
+        decided_by = common | own | {"years": plain(cfg.years)}
+        done = finished(path, decided_by)
+        if done is None:
+            done = {"options": decided_by, "scores": score_rung(scenes, rollouts, list(cfg.years), name)}
+            write_json(path, done)
+        ladder[name] = done["scores"]
+    return ladder
+
+
+@hydra.main(**CONFIG, config_name="ladder")
+@recipe
+def main(cfg: DictConfig) -> None:
+    """Entry point of ``python -m recipes.ladder``."""
+    scenes = open_splits(cfg.scenes)[cfg.split]
+    ladder = climb(cfg, scenes)
+    table = Table("rung", *(f"realism {year} [95 %]" for year in cfg.years), "minADE", "collision", "off-road")
+    last = list(cfg.years)[-1]
+    for name, scores in ladder.items():
+        means = [summary([scores[year]["realism"]]) for year in cfg.years]
+        cells = [f"{found.mean:.3f} [{found.low:.3f}, {found.high:.3f}]" for found in means]
+        rest = [torch.tensor(scores[last][key]).mean() for key in ("min_ade", "collision_rate", "offroad_rate")]
+        table.add_row(name, *cells, *(f"{value:.3f}" for value in rest))
+    Console(width=140).print(table)
+    if cfg.json is not None:
+        write_json(cfg.json, {"scenes": len(scenes), "years": list(cfg.years), "rungs": ladder})
+
+
+if __name__ == "__main__":
+    main()
