@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dpa.realism.config import Histogram, Indicator, Kernel, RealismConfig
-from dpa.realism.features import Features, measure
+from dpa.realism.features import Features, Generated, measure
 from dpa.realism.metric import RealismResult, mean_result, realism
 from dpa.realism.quirks import Quirk
 
 __all__ = [
     "Features",
+    "Generated",
     "Histogram",
     "Indicator",
     "Kernel",

@@ -94,6 +94,8 @@ class RealismConfig:
         height_stretch: how much a metre of height counts when the nearest road edge is chosen.
         ttc_vehicle_only: score the time to collision of vehicles only.
         traffic_lights: score driving through red lights.
+        scenario_generation: rollouts are scenes of the Scenario Generation challenge: all 91 steps, every agent scored
+            at each of them, and no log to be displaced from.
         quirks: of the official code that are kept.
         continuous: for each name in :data:`CONTINUOUS`.
         indicators: for each name in :data:`INDICATORS`.
@@ -114,6 +116,7 @@ class RealismConfig:
     height_stretch: float
     ttc_vehicle_only: bool
     traffic_lights: bool
+    scenario_generation: bool
     quirks: frozenset[Quirk]
     continuous: Mapping[str, Histogram | Kernel]
     indicators: Mapping[str, Indicator]
@@ -137,7 +140,8 @@ class RealismConfig:
         except yaml.YAMLError as error:
             raise ValueError(f"{path} is not YAML: {error}") from None
         _check_keys(data, {field.name for field in dataclasses.fields(cls)} - {"name"}, path, "the file")
-        plain = {"corner_rounding": float, "height_stretch": float, "ttc_vehicle_only": bool, "traffic_lights": bool}
+        switches = ("ttc_vehicle_only", "traffic_lights", "scenario_generation")
+        plain = {"corner_rounding": float, "height_stretch": float} | dict.fromkeys(switches, bool)
         return cls(
             name=path.stem,
             differences=_choice(data["differences"], get_args(Differences), path, "differences"),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -51,14 +52,15 @@ _SMALL_OVERLAP = 0.5
 
 @dataclass(frozen=True)
 class Features:
-    """Measurements of E evaluated agents in ascending order of track id.
+    """Measurements of E evaluated agents in ascending order of track id at T scored steps (80, or 91 if generated).
 
     Attributes:
-        values: name to ``[C, E, 80]``; float for continuous features, bool for ``collision_per_step``,
+        values: name to ``[C, E, T]``; float for continuous features, bool for ``collision_per_step``,
             ``offroad_per_step`` and, if asked for, ``traffic_light_violation_per_step``.
         displacement: ``[R, E]``, mean distance from the log over all 91 steps [m].
-        valid: ``[E, 82]`` bool, the agent is there in the log, from two steps before the first measured one on.
-        vehicle: ``[E]`` bool.
+        valid: ``[E, context + T]`` bool, the agent is there in the log, from the context of differences on (two steps;
+            none of generated scenes).
+        vehicle: ``[C, E]`` bool.
         track_id: ``[E]`` int64.
     """
 
@@ -68,40 +70,71 @@ class Features:
     vehicle: Tensor
     track_id: Tensor
 
+    @property
+    def scored(self) -> Tensor:
+        """``[E, T]`` bool: steps of :attr:`values` at which the agent is there in the log."""
+        return self.valid[:, -self.values["linear_speed"].shape[-1] :]
+
+
+class Generated(NamedTuple):
+    """What rollouts of the Scenario Generation challenge bring along.
+
+    Attributes:
+        extent: ``[R, A, 3]``, length, width, height [m].
+        kind: ``[R, A]`` int64, :class:`~envs.scene.AgentKind`.
+    """
+
+    extent: Tensor
+    kind: Tensor
+
 
 @dataclass(frozen=True)
 class _Tracks:
-    """C scenes of A simulated agents over the scored steps and their context, ``L = 82``.
+    """C scenes of A simulated agents over L steps: the scored ones behind their context.
 
     Attributes:
         position: ``[C, A, L, 3]``.
         heading: ``[C, A, L]``.
         valid: ``[C, A, L]`` bool.
-        extent: ``[A, 3]``.
+        extent: ``[C, A, 3]``.
+        vehicle: ``[C, A]`` bool.
         ego: ``[E]`` int64, the evaluated agents.
+        context: steps ahead of the scored ones, that differences reach back to.
     """
 
     position: Tensor
     heading: Tensor
     valid: Tensor
     extent: Tensor
+    vehicle: Tensor
     ego: Tensor
+    context: int
+
+    @property
+    def scored(self) -> slice:
+        """The scored steps."""
+        return slice(self.context, None)
 
 
-def measure(scene: Scene, simulated: Tensor, config: RealismConfig) -> Features:
+def measure(scene: Scene, simulated: Tensor, config: RealismConfig, generated: Generated | None = None) -> Features:
     """Measure the log and the rollouts of one uncollated scene.
 
     Args:
         scene: the scene; agents that are not present at the current step take no part.
-        simulated: ``[R, A, 80, 4]``, x, y, z, heading of the present agents in their order.
+        simulated: ``[R, A, 80, 4]``, x, y, z, heading of the present agents in their order; ``[R, A, 91, 4]`` if
+            ``config.scenario_generation``.
         config: which options apply.
+        generated: sizes and classes of generated agents; those of the log by default.
     """
     scene, simulated = to_world(scene, simulated)
     scene = select_agents(scene, scene.agents.present)
     agents = scene.agents
-    ego = agents.evaluated.nonzero()[:, 0]
-    ego = ego[agents.track_id[ego].argsort()]
-    tracks = _join(scene, simulated, ego, ghosts=Quirk.GHOSTS in config.quirks)
+    if config.scenario_generation:
+        tracks = _join_generated(scene, simulated, agents.track_id.argsort(), generated)
+    else:
+        ego = agents.evaluated.nonzero()[:, 0]
+        tracks = _join(scene, simulated, ego[agents.track_id[ego].argsort()], Quirk.GHOSTS in config.quirks)
+    ego = tracks.ego
     distance = _nearest_object(tracks, config.corner_rounding)
     edges = RoadEdges.from_polylines(
         polylines(scene, EDGE_KINDS),
@@ -119,15 +152,16 @@ def measure(scene: Scene, simulated: Tensor, config: RealismConfig) -> Features:
         "offroad_per_step": road_edge > 0,
     }
     if config.traffic_lights:
-        # a crossing compares a step with the one before it
-        steps = slice(_CONTEXT - 1, None)
-        position, valid = tracks.position[:, ego, steps, :2], tracks.valid[:, ego, steps]
-        values["traffic_light_violation_per_step"] = red_light_violation(scene, position, valid, config.quirks)
+        values["traffic_light_violation_per_step"] = _red_lights(tracks, scene, config)
+    if config.scenario_generation:  # there is no log to be displaced from
+        displacement = simulated.new_zeros(len(simulated), len(ego))
+    else:
+        displacement = _displacement(scene, simulated, ego, Quirk.HISTORY_IN_ADE in config.quirks)
     return Features(
         values=values,
-        displacement=_displacement(scene, simulated, ego, Quirk.HISTORY_IN_ADE in config.quirks),
-        valid=agents.valid[ego, -HORIZON - _CONTEXT :],
-        vehicle=agents.kind[ego] == AgentKind.VEHICLE,
+        displacement=displacement,
+        valid=tracks.valid[1, ego] if config.scenario_generation else agents.valid[ego, -HORIZON - _CONTEXT :],
+        vehicle=tracks.vehicle[:, ego],
         track_id=agents.track_id[ego],
     )
 
@@ -177,8 +211,27 @@ def _join(scene: Scene, simulated: Tensor, ego: Tensor, ghosts: bool) -> _Tracks
         position=torch.cat((position[None], torch.cat((context, simulated[..., :3]), 2))),
         heading=torch.cat((heading[None], torch.cat((heading_context, simulated[..., 3]), 2))),
         valid=torch.cat((valid[None], simulated_valid.expand(rollouts, -1, -1))),
-        extent=agents.extent,
+        extent=agents.extent.expand(rollouts + 1, -1, -1),
+        vehicle=(agents.kind == AgentKind.VEHICLE).expand(rollouts + 1, -1),
         ego=ego,
+        context=_CONTEXT,
+    )
+
+
+def _join_generated(scene: Scene, simulated: Tensor, ego: Tensor, generated: Generated | None) -> _Tracks:
+    """Put the log and the generated scenes side by side (SPEC section 7): all 91 steps, all agents, always valid."""
+    agents, rollouts = scene.agents, simulated.shape[0]
+    extent, kind = agents.extent.expand(rollouts, -1, -1), agents.kind.expand(rollouts, -1)
+    if generated is not None:
+        extent, kind = generated.extent.to(extent), generated.kind.to(kind)
+    return _Tracks(
+        position=torch.cat((agents.position[None], simulated[..., :3])),
+        heading=torch.cat((agents.heading[None], simulated[..., 3])),
+        valid=torch.ones(rollouts + 1, *agents.valid.shape, dtype=torch.bool, device=simulated.device),
+        extent=torch.cat((agents.extent[None], extent)),
+        vehicle=torch.cat((agents.kind[None], kind)) == AgentKind.VEHICLE,
+        ego=ego,
+        context=0,
     )
 
 
@@ -222,25 +275,24 @@ def _kinematics(tracks: _Tracks, config: RealismConfig) -> dict[str, Tensor]:
         "angular_speed": turn / STEP_SECONDS,
         "angular_acceleration": angular_acceleration,
     }
-    return {name: value[..., _CONTEXT:] for name, value in values.items()}
+    return {name: value[..., tracks.scored] for name, value in values.items()}
 
 
 def _nearest_object(tracks: _Tracks, rounding: float) -> Tensor:
-    """Signed distance of the evaluated agents to the nearest other box (SPEC section 3.1) -> ``[C, E, 80]`` [m]."""
-    scenes = tracks.position.shape[0]
-    size = tracks.extent[:, None, :2].expand(scenes, -1, HORIZON, -1)
-    pose = torch.cat((tracks.position[..., :2], tracks.heading[..., None]), -1)[:, :, _CONTEXT:]
+    """Signed distance of the evaluated agents to the nearest other box (SPEC section 3.1) -> ``[C, E, T]`` [m]."""
+    pose = torch.cat((tracks.position[..., :2], tracks.heading[..., None]), -1)[:, :, tracks.scored]
+    size = tracks.extent[:, :, None, :2].expand(-1, -1, pose.shape[2], -1)
     boxes = torch.cat((pose, size), -1).transpose(1, 2)
-    valid = tracks.valid[:, :, _CONTEXT:].transpose(1, 2)
+    valid = tracks.valid[:, :, tracks.scored].transpose(1, 2)
     return nearest_box_distance(boxes, valid, tracks.ego, rounding).transpose(1, 2)
 
 
 def _time_to_collision(tracks: _Tracks, config: RealismConfig) -> Tensor:
-    """Time until evaluated agents reach their leaders at present speeds (SPEC section 3.2) -> ``[C, E, 80]`` [s]."""
-    speed = _speed(tracks.position[..., :2], config.differences)[..., _CONTEXT:]
-    position, heading = tracks.position[:, :, _CONTEXT:, :2], tracks.heading[:, :, _CONTEXT:]
-    valid = tracks.valid[:, :, _CONTEXT:]
-    length, width = tracks.extent[:, 0, None], tracks.extent[:, 1, None]
+    """Time until evaluated agents reach their leaders at present speeds (SPEC section 3.2) -> ``[C, E, T]`` [s]."""
+    speed = _speed(tracks.position[..., :2], config.differences)[..., tracks.scored]
+    position, heading = tracks.position[:, :, tracks.scored, :2], tracks.heading[:, :, tracks.scored]
+    valid = tracks.valid[:, :, tracks.scored]
+    length, width = tracks.extent[..., 0, None], tracks.extent[..., 1, None]
     result = []
     for ego in tracks.ego.tolist():
         turn = heading - heading[:, ego, None]
@@ -249,8 +301,8 @@ def _time_to_collision(tracks: _Tracks, config: RealismConfig) -> Tensor:
         turn = turn.abs()
         cos, sin = turn.cos().abs(), turn.sin().abs()
         ahead, aside = rotate(position - position[:, ego, None], -heading[:, ego, None]).unbind(-1)
-        gap = ahead - length[ego] / 2 - (length * cos + width * sin) / 2
-        overlap = aside.abs() - width[ego] / 2 - (length * sin + width * cos) / 2
+        gap = ahead - length[:, ego, None] / 2 - (length * cos + width * sin) / 2
+        overlap = aside.abs() - width[:, ego, None] / 2 - (length * sin + width * cos) / 2
         aligned = (turn <= _FOLLOW_ANGLE) & ((overlap < -_SMALL_OVERLAP) | (turn <= _FOLLOW_ANGLE_SMALL_OVERLAP))
         followed = (gap > 0) & (overlap < 0) & aligned & valid
         nearest, leader = torch.where(followed, gap, torch.inf).min(1)
@@ -260,14 +312,23 @@ def _time_to_collision(tracks: _Tracks, config: RealismConfig) -> Tensor:
 
 
 def _road_edge(tracks: _Tracks, edges: RoadEdges) -> Tensor:
-    """Signed distance of the evaluated agents to the road edge (SPEC section 4.1) -> ``[C, E, 80]`` [m]."""
-    position = tracks.position[:, tracks.ego, _CONTEXT:]
-    heading = tracks.heading[:, tracks.ego, _CONTEXT:]
-    valid = tracks.valid[:, tracks.ego, _CONTEXT:]
-    extent = tracks.extent[tracks.ego, None].expand(position.shape)
+    """Signed distance of the evaluated agents to the road edge (SPEC section 4.1) -> ``[C, E, T]`` [m]."""
+    position = tracks.position[:, tracks.ego, tracks.scored]
+    heading = tracks.heading[:, tracks.ego, tracks.scored]
+    valid = tracks.valid[:, tracks.ego, tracks.scored]
+    extent = tracks.extent[:, tracks.ego, None].expand(position.shape)
     result = position.new_full(valid.shape, _OFF_MAP)
     result[valid] = edges.box_offroad_distance(position[valid], heading[valid], extent[valid])
     return result
+
+
+def _red_lights(tracks: _Tracks, scene: Scene, config: RealismConfig) -> Tensor:
+    """Steps at which the evaluated agents drive through red lights (SPEC section 4.2) -> ``[C, E, T]`` bool."""
+    # A crossing compares a step with the one before it; nothing is crossed at the first step of a generated scene.
+    before = max(tracks.context - 1, 0)
+    position, valid = tracks.position[:, tracks.ego, before:, :2], tracks.valid[:, tracks.ego, before:]
+    violation = red_light_violation(scene, position, valid, config.quirks)
+    return violation if tracks.context else pad(violation, (1, 0))
 
 
 def _displacement(scene: Scene, simulated: Tensor, ego: Tensor, with_history: bool) -> Tensor:

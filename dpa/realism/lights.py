@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dpa.realism.quirks import Quirk
-from envs.scene import CURRENT_STEP, LightState, MapKind, Scene
+from envs.scene import LightState, MapKind, Scene
 
 _RED = (LightState.ARROW_STOP, LightState.STOP)
 _DISTANCES_PER_CHUNK = 1 << 20
@@ -36,19 +36,19 @@ def red_light_violation(scene: Scene, position: Tensor, valid: Tensor, quirks: S
     Args:
         scene: an uncollated scene in the frame of the world (:func:`dpa.realism.features.to_world`), for its lanes
             and lights.
-        position: ``[C, E, 81, 2]``, centres from the current step on [m].
-        valid: ``[C, E, 81]`` bool.
+        position: ``[C, E, L, 2]``, centres at the last L of the 91 steps [m].
+        valid: ``[C, E, L]`` bool.
         quirks: of the official code that are kept.
 
     Returns:
-        ``[C, E, 80]`` bool, for the steps after the current one.
+        ``[C, E, L - 1]`` bool, for the steps after the first one.
     """
     violation = torch.zeros_like(valid[..., 1:])
     lanes = _surface_lanes(scene, Quirk.LANES_TO_ORIGIN in quirks)
     if lanes is None:
         return violation
     sign = 1.0 if Quirk.PLUS_FOR_MINUS in quirks else -1.0
-    lane_ids, states, stops = _signals(scene)
+    lane_ids, states, stops = _signals(scene, position.shape[2])
     passed, lane = [], []
     for lane_id, state, stop in zip(lane_ids, states, stops, strict=True):
         own = lanes.owner == lane_id
@@ -91,24 +91,24 @@ def _surface_lanes(scene: Scene, to_origin: bool) -> _Lanes | None:
     )
 
 
-def _signals(scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
-    """Lanes ``[G]``, states ``[G, 81]`` and stop points ``[G, 81, 2]`` of the lights from the current step on."""
+def _signals(scene: Scene, steps: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Lanes ``[G]``, states ``[G, L]`` and stop points ``[G, L, 2]`` of the lights at the last L steps."""
     lights = scene.lights
-    return lights.lane_id, lights.state[:, CURRENT_STEP:], lights.stop_point[:, CURRENT_STEP:, :2]
+    return lights.lane_id, lights.state[:, -steps:], lights.stop_point[:, -steps:, :2]
 
 
 def _passes(position: Tensor, stop: Tensor, start: Tensor, delta: Tensor, sign: float) -> Tensor:
     """Agents go from behind the stop point of one lane to beyond it.
 
     Args:
-        position: ``[C, E, 81, 2]``.
-        stop: ``[81, 2]``, stop point of the lane.
+        position: ``[C, E, L, 2]``.
+        stop: ``[L, 2]``, stop point of the lane.
         start: ``[W', 2]``, segments of the lane.
         delta: ``[W', 2]``.
         sign: see :func:`_distance`.
 
     Returns:
-        ``[C, E, 80]`` bool.
+        ``[C, E, L - 1]`` bool.
     """
     segment = _distance(stop, start, delta, sign).argmin(-1)
     start, delta = start[segment], delta[segment]

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from dpa.realism.config import BUCKETS, Differences, RealismConfig
 from dpa.realism.estimators import indicator_log_likelihood, log_likelihood
-from dpa.realism.features import HORIZON, Features, measure
+from dpa.realism.features import HORIZON, Features, Generated, measure
 from dpa.realism.quirks import Quirk
-from envs.scene import Scene
+from envs.scene import LOG_STEPS, Scene
 
 _EVENTS = {
     "collision_indication": "collision_per_step",
@@ -106,6 +106,7 @@ def realism(
     config: str | Path | RealismConfig = "2024",
     *,
     quirks: bool = True,
+    generated: Generated | None = None,
     features: bool = False,
 ) -> RealismResult:
     """Score rollouts of one scene.
@@ -116,10 +117,12 @@ def realism(
     Args:
         scene: one uncollated scene.
         simulated: ``[R, A, 80, 4]``, x, y, z, heading of steps 11 to 90 in the scene's frame, where A are the agents
-            with ``scene.agents.present``, in that order. The standard is R = 32.
+            with ``scene.agents.present``, in that order. The standard is R = 32. With a configuration of the Scenario
+            Generation challenge ``[R, A, 91, 4]``, all steps.
         config: the year, a path or a :class:`RealismConfig`.
         quirks: ``False`` leaves out all that looks like an accident of the official code (:mod:`dpa.realism.quirks`):
             a cleaner metric, whose numbers compare with no others.
+        generated: sizes and classes that generated scenes bring along; those of the log by default.
         features: also return what was measured.
 
     Raises:
@@ -135,8 +138,8 @@ def realism(
     """
     config = config if isinstance(config, RealismConfig) else RealismConfig.load(config)
     config = config if quirks else config.replace(quirks=frozenset())
-    _check(scene, simulated)
-    measured = measure(scene, simulated.to(scene.agents.position.dtype), config)
+    _check(scene, simulated, config, generated)
+    measured = measure(scene, simulated.to(scene.agents.position.dtype), config, generated)
     likelihood = {**_continuous_likelihoods(measured, config), **_indicator_likelihoods(measured, config)}
     weights = config.weights
     displacement = measured.displacement
@@ -189,13 +192,20 @@ def mean_result(results: Sequence[RealismResult]) -> RealismResult:
     )
 
 
-def _check(scene: Scene, simulated: Tensor) -> None:
-    agents = int(scene.agents.present.sum())
-    if simulated.ndim != 4 or not len(simulated) or simulated.shape[1:] != (agents, HORIZON, 4):
+def _check(scene: Scene, simulated: Tensor, config: RealismConfig, generated: Generated | None) -> None:
+    agents, steps = int(scene.agents.present.sum()), LOG_STEPS if config.scenario_generation else HORIZON
+    if simulated.ndim != 4 or not len(simulated) or simulated.shape[1:] != (agents, steps, 4):
         raise ValueError(
-            f"scene {scene.scene_id}: rollouts must have shape [R, {agents}, {HORIZON}, 4] (rollouts, agents present "
+            f"scene {scene.scene_id}: rollouts must have shape [R, {agents}, {steps}, 4] (rollouts, agents present "
             f"at the current step, steps, x y z heading) with R >= 1, got {list(simulated.shape)}."
         )
+    if generated is not None:
+        shapes, wanted = [list(part.shape) for part in generated], [[*simulated.shape[:2], 3], [*simulated.shape[:2]]]
+        if not config.scenario_generation or shapes != wanted:
+            raise ValueError(
+                f"scene {scene.scene_id}: extent and kind of generated agents must have the shapes {wanted}, got "
+                f"{shapes}; only configurations of the Scenario Generation challenge take them, not {config.name!r}."
+            )
     finite = torch.isfinite(simulated)
     if not finite.all():
         rollout, agent, step, column = (~finite).nonzero()[0].tolist()
@@ -225,18 +235,18 @@ def _continuous_likelihoods(measured: Features, config: RealismConfig) -> dict[s
 
 
 def _masks(measured: Features, config: RealismConfig) -> dict[str, Tensor]:
-    """Steps ``[E, 80]`` at which the log of each continuous feature counts."""
-    scored = measured.valid[:, -HORIZON:]
+    """Steps ``[E, T]`` at which the log of each continuous feature counts."""
+    scored, steps = measured.scored, measured.scored.shape[-1]
     # The official code looks for neighbours among the scored steps only, so the ends have none.
     known = scored if Quirk.ENDS_UNSCORED in config.quirks else measured.valid
     speed = _with_neighbours(known, config.differences)
-    acceleration = _with_neighbours(speed, config.differences)[:, -HORIZON:]
-    ttc = scored & measured.vehicle[:, None] if config.ttc_vehicle_only else scored
+    acceleration = _with_neighbours(speed, config.differences)[:, -steps:]
+    ttc = scored & measured.vehicle[0, :, None] if config.ttc_vehicle_only else scored
     if Quirk.LAST_TTC not in config.quirks and config.differences == "central":
-        ttc = ttc & (torch.arange(HORIZON, device=ttc.device) < HORIZON - 1)
+        ttc = ttc & (torch.arange(steps, device=ttc.device) < steps - 1)
     return {
-        "linear_speed": speed[:, -HORIZON:],
-        "angular_speed": speed[:, -HORIZON:],
+        "linear_speed": speed[:, -steps:],
+        "angular_speed": speed[:, -steps:],
         "linear_acceleration": acceleration,
         "angular_acceleration": acceleration,
         "distance_to_nearest_object": scored,
@@ -280,7 +290,7 @@ def _happened(measured: Features, event: str, config: RealismConfig) -> Tensor:
     """``[C, E]`` bool: the event happened at some step at which the agent is there in the log."""
     happened = measured.values[event]
     if Quirk.GHOSTS not in config.quirks:
-        happened = happened & measured.valid[:, -HORIZON:]
+        happened = happened & measured.scored
     return happened.any(-1)
 
 
