@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dpa.realism.config import Histogram, Indicator, Kernel, RealismConfig
-from dpa.realism.features import Features, Generated, measure
-from dpa.realism.metric import RealismResult, mean_result, realism
+from dpa.realism.features import Features, measure
+from dpa.realism.metric import RealismResult, mean_result, realism, realism_of
 from dpa.realism.quirks import Quirk
+from dpa.realism.tracks import Generated, compare
 
 __all__ = [
     "Features",
@@ -16,7 +17,9 @@ __all__ = [
     "Quirk",
     "RealismConfig",
     "RealismResult",
+    "compare",
     "mean_result",
     "measure",
     "realism",
+    "realism_of",
 ]

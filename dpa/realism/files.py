@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpa.realism.features import HORIZON
 from dpa.realism.submission import SubmissionReader, decode_rollouts
+from dpa.realism.tracks import HORIZON
 from envs.scene import CURRENT_STEP, LOG_STEPS, MapKind, Scene
 from envs.sources.recording import LightListing, Polyline, Recording
 from envs.sources.womd import METRES_PER_SECOND_PER_MPH, read_womd

@@ -34,7 +34,7 @@ def red_light_violation(scene: Scene, position: Tensor, valid: Tensor, quirks: S
     """Steps at which agents pass the stop point of the lane that they are on while its light is red.
 
     Args:
-        scene: an uncollated scene in the frame of the world (:func:`dpa.realism.features.to_world`), for its lanes
+        scene: an uncollated scene in the frame of the world (:func:`dpa.realism.tracks.to_world`), for its lanes
             and lights.
         position: ``[C, E, L, 2]``, centres at the last L of the 91 steps [m].
         valid: ``[C, E, L]`` bool.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,9 +11,14 @@ from torch import Tensor
 
 from dpa.realism.config import BUCKETS, Differences, RealismConfig
 from dpa.realism.estimators import indicator_log_likelihood, log_likelihood
-from dpa.realism.features import HORIZON, Features, Generated, measure
+from dpa.realism.features import Features, measure
 from dpa.realism.quirks import Quirk
+from dpa.realism.tracks import HORIZON, Comparison, Generated, compare
 from envs.scene import LOG_STEPS, Scene
+
+BYTES_PER_GIB = 1 << 30
+BYTES_PER_POSE = 170
+"""Peak memory of measuring a batch, by agents x steps x (rollouts and log); of 4 to 32 crowded scenes on a CPU."""
 
 _EVENTS = {
     "collision_indication": "collision_per_step",
@@ -136,13 +141,76 @@ def realism(
         >>> result.min_ade, result.collision_rate
         (0.0, 0.0)
     """
+    return realism_of([scene], [simulated], config, quirks=quirks, generated=[generated], features=features)[0]
+
+
+@torch.no_grad()
+def realism_of(
+    scenes: Sequence[Scene],
+    simulated: Sequence[Tensor],
+    config: str | Path | RealismConfig = "2024",
+    *,
+    quirks: bool = True,
+    generated: Sequence[Generated | None] | None = None,
+    features: bool = False,
+    memory: float = 1.0,
+) -> list[RealismResult]:
+    """Score rollouts of several scenes, many at a time; the arguments are those of :func:`realism`, one of each scene.
+
+    Scenes in one batch share the cost of starting each operation. That is for GPUs; on a CPU one scene at a time is
+    faster by a tenth to a quarter, as its working set stays in the cache.
+
+    Args:
+        scenes: uncollated, all on one device.
+        simulated: rollouts of each.
+        config: see :func:`realism`.
+        quirks: see :func:`realism`.
+        generated: see :func:`realism`.
+        features: see :func:`realism`.
+        memory: roughly what the batch may take beyond its inputs [GiB]; a scene that needs more is scored alone.
+
+    Raises:
+        ValueError: as for :func:`realism`, or not as many rollouts as scenes.
+
+    Examples:
+        >>> from envs.sources.synthetic import straight_road
+        >>> scenes = [straight_road(num_vehicles=n, seed=n) for n in (2, 3)]
+        >>> [result.min_ade for result in realism_of(scenes, [torch.zeros(4, n, 80, 4) for n in (2, 3)])] != [0.0, 0.0]
+        True
+    """
     config = config if isinstance(config, RealismConfig) else RealismConfig.load(config)
     config = config if quirks else config.replace(quirks=frozenset())
-    _check(scene, simulated, config, generated)
-    measured = measure(scene, simulated.to(scene.agents.position.dtype), config, generated)
+    extras = [None] * len(scenes) if generated is None else generated
+    comparisons = []
+    for scene, poses, extra in zip(scenes, simulated, extras, strict=True):
+        _check(scene, poses, config, extra)
+        comparisons.append(compare(scene, poses.to(scene.agents.position.dtype), config, extra))
+    return [
+        _score(measured, config, features)
+        for batch in _batches(comparisons, memory * BYTES_PER_GIB)
+        for measured in measure(batch, config)
+    ]
+
+
+def _batches(comparisons: list[Comparison], budget: float) -> Iterator[list[Comparison]]:
+    """Neighbouring scenes whose working sets fit into the budget [bytes] together, one at least."""
+    batch: list[Comparison] = []
+    for each in comparisons:
+        rows, agents = 0, 0
+        for other in (*batch, each):
+            rows, agents = rows + len(other.tracks.valid), max(agents, other.tracks.valid.shape[1])
+        needed = rows * agents * each.tracks.valid.shape[2] * BYTES_PER_POSE
+        if batch and needed > budget:
+            yield batch
+            batch = []
+        batch.append(each)
+    if batch:
+        yield batch
+
+
+def _score(measured: Features, config: RealismConfig, features: bool) -> RealismResult:
     likelihood = {**_continuous_likelihoods(measured, config), **_indicator_likelihoods(measured, config)}
-    weights = config.weights
-    displacement = measured.displacement
+    weights, displacement = config.weights, measured.displacement
     return RealismResult(
         realism=sum(weights[name] * value for name, value in likelihood.items()),
         likelihood=likelihood,

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dpa.realism.features import HORIZON
 from dpa.realism.submission.messages import POSE_FIELDS, ScenarioRollouts, SubmissionError
+from dpa.realism.tracks import HORIZON
 from envs.scene import Scene
 
 _INT32 = torch.iinfo(torch.int32)

@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from dpa.realism.features import HORIZON
 from dpa.realism.submission import wire
 from dpa.realism.submission.messages import NUM_ROLLOUTS, POSE_FIELDS, CorruptError
 from dpa.realism.submission.metadata import metadata_faults, read_fields
 from dpa.realism.submission.reader import Entry, check_exists, damage_told, entries
+from dpa.realism.tracks import HORIZON
 from envs.scene import CURRENT_STEP, Scene, SceneSource
 
 MAX_FIRST_STEP = 100.0

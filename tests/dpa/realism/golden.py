@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpa.realism import Quirk, RealismConfig
+from dpa.realism import Features, Quirk, RealismConfig, compare, measure
 from envs.scene import CURRENT_STEP, LOG_STEPS, Agents, Lights, LightState, MapKind, RoadMap, Scene
 
 SHIPPED = Path(__file__).resolve().parents[2] / "data" / "realism"
@@ -27,6 +27,11 @@ def golden_config(code: str, year: str) -> RealismConfig:
     weights, config = RealismConfig.load(year), RealismConfig.load(CODES[code])
     quirks = config.quirks | ({Quirk.GHOSTS} if code == "code2023" else set())
     return config.replace(continuous=weights.continuous, indicators=weights.indicators, quirks=quirks)
+
+
+def measured(scene: Scene, rollouts: Tensor, config: RealismConfig) -> Features:
+    """What the metric measures of one scene."""
+    return measure([compare(scene, rollouts, config)], config)[0]
 
 
 @dataclass(frozen=True)

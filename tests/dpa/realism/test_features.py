@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from dpa.realism import RealismConfig, measure
+from dpa.realism import RealismConfig
 from envs.scene import Scene
 from envs.sources.synthetic import build_scene, straight_road
-from tests.dpa.realism.golden import CODES, SHIPPED, Golden, golden_config
+from tests.dpa.realism.golden import CODES, SHIPPED, Golden, golden_config, measured
 
 CONFIG = RealismConfig.load("2025")
 
@@ -28,14 +28,14 @@ FLIPS = {
 
 def check_against_official(golden: Golden, *, moved: bool, code: str = "code2025") -> None:
     scene = golden.load_scene(moved=moved)
-    measured = measure(scene, golden.load_rollouts(scene), golden_config(code, CODES[code]))
+    found = measured(scene, golden.load_rollouts(scene), golden_config(code, CODES[code]))
     official = golden.load_features(code)
-    np.testing.assert_array_equal(measured.track_id.numpy(), official["log_object_id"])
-    np.testing.assert_array_equal(measured.valid[:, 2:].numpy(), official["log_valid"][0])
+    np.testing.assert_array_equal(found.track_id.numpy(), official["log_object_id"])
+    np.testing.assert_array_equal(found.valid[:, 2:].numpy(), official["log_valid"][0])
     np.testing.assert_allclose(
-        measured.displacement.numpy(), official["sim_average_displacement_error"], rtol=1e-5, atol=1e-5
+        found.displacement.numpy(), official["sim_average_displacement_error"], rtol=1e-5, atol=1e-5
     )
-    for name, value in measured.values.items():
+    for name, value in found.values.items():
         if code == "code2023" and name in ("collision_per_step", "offroad_per_step"):
             continue  # the first code gave events of whole rollouts only; test_metric has those
         expected = np.concatenate([official[f"log_{name}"], official[f"sim_{name}"]])
@@ -81,7 +81,7 @@ def log_as_rollout(scene: Scene) -> torch.Tensor:
 
 def test_differences_at_the_end_of_a_rollout_are_not_a_number() -> None:
     scene = straight_road(num_vehicles=1)
-    values = measure(scene, log_as_rollout(scene), CONFIG).values
+    values = measured(scene, log_as_rollout(scene), CONFIG).values
     assert values["linear_speed"].isnan().sum(-1).unique().tolist() == [1]
     assert values["angular_acceleration"].isnan().sum(-1).unique().tolist() == [2]
     assert not values["linear_speed"][..., 0].isnan().any()
@@ -91,7 +91,7 @@ def test_speed_counts_the_height_too() -> None:
     scene = straight_road(num_vehicles=1, speed=10.0)
     rollout = log_as_rollout(scene)
     rollout[..., 2] = 0.5 * torch.arange(80)
-    speed = measure(scene, rollout, CONFIG).values["linear_speed"][1, 0, 40]
+    speed = measured(scene, rollout, CONFIG).values["linear_speed"][1, 0, 40]
     assert speed.item() == pytest.approx(math.hypot(10, 5), rel=1e-4)
 
 
@@ -101,7 +101,7 @@ def test_invalid_history_lies_at_the_origin_of_the_world() -> None:
     scene.agents.valid[1, 9] = False
     scene.agents.position[1, 9] = 0
     scene.origin = torch.tensor([3000.0, 4000.0, 0.0], dtype=torch.float64)
-    acceleration = measure(scene, rollout, CONFIG).values["linear_acceleration"][1, 1, 0]
+    acceleration = measured(scene, rollout, CONFIG).values["linear_acceleration"][1, 1, 0]
     # speed at step 10 is half the way to the origin in 0.1 s, speed at step 12 nearly nothing beside it
     assert acceleration.item() == pytest.approx(-(5000 / 0.2) / 0.2, rel=1e-2)
 
@@ -113,7 +113,7 @@ def test_time_to_collision_is_the_gap_over_the_closing_speed() -> None:
     poses[1, :, 0] = 60 + 6 * time
     edge = torch.tensor([[200.0, 5.0], [-200.0, 5.0]])
     scene = build_scene(poses, [(15, edge)])
-    ttc = measure(scene, log_as_rollout(scene), CONFIG).values["time_to_collision"]
+    ttc = measured(scene, log_as_rollout(scene), CONFIG).values["time_to_collision"]
     gap = 60 - 4.6 - 4 * time[11:]
     expected = (gap / 4).clamp(max=5.0)
     torch.testing.assert_close(ttc[1, 0, :-1], expected[:-1], atol=1e-2, rtol=0)
@@ -128,7 +128,7 @@ def test_headings_on_both_sides_of_pi_do_not_follow_each_other() -> None:
         poses[1, :, 0] = -100 - 0.2 * torch.arange(91)
         poses[0, :, 2], poses[1, :, 2] = 3.1, heading
         scene = build_scene(poses, [(15, torch.tensor([[200.0, 5.0], [-200.0, 5.0]]))])
-        return measure(scene, log_as_rollout(scene), CONFIG).values["time_to_collision"][1, 0].min().item()
+        return measured(scene, log_as_rollout(scene), CONFIG).values["time_to_collision"][1, 0].min().item()
 
     assert shortest(3.1) < 5.0
     assert shortest(-3.1) == 5.0

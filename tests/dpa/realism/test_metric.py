@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dpa.realism import RealismResult, mean_result, realism
+from dpa.realism import RealismResult, mean_result, realism, realism_of
 from envs.scene import CURRENT_STEP, AgentKind, Agents, Scene, collate, select_agents
 from envs.sources.synthetic import straight_road, two_cars_head_on
 from tests.dpa.realism.golden import CODES, SHIPPED, Golden, golden_config
@@ -152,6 +152,24 @@ def test_moving_the_world_changes_nothing_but_rounding(shift: tuple[int, int], y
 def log_as_rollout(scene: Scene) -> torch.Tensor:
     agents = scene.agents
     return torch.cat((agents.position, agents.heading[..., None]), -1)[None, agents.present, 11:]
+
+
+@pytest.mark.parametrize("memory", [1.0, 1e-6])
+@pytest.mark.parametrize("year", ["2023", "2025"])
+def test_scenes_of_any_size_score_together_as_they_do_alone(golden_scene, year: str, memory: float) -> None:
+    scene, rollouts = golden_scene
+    small = straight_road(num_vehicles=2, seed=3)
+    log = log_as_rollout(small)
+    scenes, simulated = [small, scene, small], [log, rollouts, log.expand(5, -1, -1, -1)]
+    alone = [realism(one, poses, year) for one, poses in zip(scenes, simulated, strict=True)]
+    assert realism_of(scenes, simulated, year, memory=memory) == alone
+
+
+def test_as_many_rollouts_as_scenes_are_needed(golden_scene) -> None:
+    scene, rollouts = golden_scene
+    with pytest.raises(ValueError, match="shorter"):
+        realism_of([scene, scene], [rollouts])
+    assert realism_of([], []) == []
 
 
 def test_one_agent_and_one_rollout_are_enough() -> None:

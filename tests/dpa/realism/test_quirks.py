@@ -7,11 +7,12 @@ import math
 import pytest
 import torch
 
-from dpa.realism import Quirk, RealismConfig, measure, realism
+from dpa.realism import Quirk, RealismConfig, realism
 from dpa.realism.lights import red_light_violation
 from envs.geometry.edges import RoadEdges
 from envs.scene import CURRENT_STEP, LightState, MapKind, Scene
 from envs.sources.synthetic import build_scene, red_light, straight_road
+from tests.dpa.realism.golden import measured
 
 OFFICIAL = RealismConfig.load("2025")
 CLEAN = OFFICIAL.replace(quirks=frozenset())
@@ -63,7 +64,7 @@ def test_invalid_at_origin() -> None:
     scene.origin = torch.tensor([3000.0, 4000.0, 0.0], dtype=torch.float64)
 
     def first_acceleration(config: RealismConfig) -> float:
-        return measure(scene, rollout, config).values["linear_acceleration"][1, 0, 0].item()
+        return measured(scene, rollout, config).values["linear_acceleration"][1, 0, 0].item()
 
     assert abs(first_acceleration(OFFICIAL)) > 1e5
     assert math.isnan(first_acceleration(without(Quirk.INVALID_AT_ORIGIN)))
@@ -85,7 +86,7 @@ def test_unwrapped_turn() -> None:
     scene = build_scene(poses, [(15, torch.tensor([[200.0, 5.0], [-200.0, 5.0]]))])
 
     def shortest(config: RealismConfig) -> float:
-        return measure(scene, log_as_rollout(scene), config).values["time_to_collision"][1, 0].min().item()
+        return measured(scene, log_as_rollout(scene), config).values["time_to_collision"][1, 0].min().item()
 
     assert shortest(OFFICIAL) == 5.0
     assert shortest(without(Quirk.UNWRAPPED_TURN)) < 5.0
@@ -174,7 +175,7 @@ def test_ghosts() -> None:
     scene.agents.position[1, 40:] = 0
 
     def log_collides(config: RealismConfig) -> bool:
-        return measure(scene, rollout, config).values["collision_per_step"][0, 0].any().item()
+        return measured(scene, rollout, config).values["collision_per_step"][0, 0].any().item()
 
     assert not log_collides(OFFICIAL)
     assert log_collides(OFFICIAL.replace(quirks=OFFICIAL.quirks | {Quirk.GHOSTS}))
