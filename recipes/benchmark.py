@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from dpa.realism import RealismConfig, realism
+from dpa.realism import RealismConfig, realism_of
 from dpa.realism.files import Scenarios
 from envs.progress import progress
 from envs.scene import CURRENT_STEP, LOG_STEPS, MapKind, Scene
@@ -96,24 +96,26 @@ def noisy_log(scene: Scene, num_rollouts: int, seed: int = 0) -> Tensor:
 
 
 def measure_realism(case: Case, options: dict[str, Any]) -> dict[str, Any]:
-    """Seconds and peak memory of the metric on one scene; runs in a process of its own."""
+    """Seconds per scene and peak memory of the metric on scenes of one kind; runs in a process of its own."""
     torch.set_num_threads(options["threads"])
-    scene = crowded_scene(case.agents, case.segments)
-    if case.path is not None:
-        scene = Scenarios(case.path).find(case.scene_id)
-    rollouts, config = noisy_log(scene, options["num_rollouts"]), RealismConfig.load(options["config"])
-    scene, rollouts = scene.to(options["device"]), rollouts.to(options["device"])
+    count, config = options["together"], RealismConfig.load(options["config"])
+    if case.path is None:
+        scenes = [crowded_scene(case.agents, case.segments, seed) for seed in range(count)]
+    else:
+        scenes = [Scenarios(case.path).find(case.scene_id)] * count
+    rollouts = [noisy_log(scene, options["num_rollouts"], seed) for seed, scene in enumerate(scenes)]
+    scenes, rollouts = ([each.to(options["device"]) for each in part] for part in (scenes, rollouts))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     seconds = []
     for _ in range(options["repeats"] + 1):  # the first one warms up
         start = time.perf_counter()
-        realism(scene, rollouts, config)
-        seconds.append(time.perf_counter() - start)
+        realism_of(scenes, rollouts, config, memory=options["memory"])
+        seconds.append((time.perf_counter() - start) / count)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return {
         "case": case.name,
-        "agents": int(scene.agents.present.sum()),
-        "evaluated": int((scene.agents.evaluated & scene.agents.present).sum()),
+        "agents": int(scenes[0].agents.present.sum()),
+        "evaluated": int((scenes[0].agents.evaluated & scenes[0].agents.present).sum()),
         "seconds": statistics.median(seconds[1:]),
         "slowest": max(seconds[1:]),
         "memory_gib": (peak - before) / KIB_PER_GIB,
@@ -160,6 +162,8 @@ def make_parser() -> argparse.ArgumentParser:
     part.add_argument("--scenarios", metavar="FILE", help="TFRecord, store or folder (default: crowded scenes)")
     part.add_argument("--config", default="2025", help="year of the metric (default: %(default)s)")
     part.add_argument("--num-rollouts", type=int, default=32, metavar="R", help="of a scene (default: %(default)s)")
+    part.add_argument("--together", type=int, default=1, metavar="G", help="scenes of one call (default: %(default)s)")
+    part.add_argument("--memory", type=float, default=1.0, metavar="GIB", help="budget of it (default: %(default)s)")
     part.add_argument("--repeats", type=int, default=5, metavar="N", help="the median counts (default: %(default)s)")
     part.add_argument("--threads", type=int, default=2, help="CPU threads (default: %(default)s)")
     part.add_argument("--device", default="cpu", help="cpu or cuda (default: %(default)s)")
