@@ -54,6 +54,9 @@ class Simulated(NamedTuple):
 class Scenarios:
     """Scenes of a file or folder, by id.
 
+    Scenes of files stay in memory once they are read, since rollouts may come in any order; of a store none does, so
+    convert large sets first.
+
     Args:
         path: a store, a file of scenarios, or a folder of such files.
 

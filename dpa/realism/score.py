@@ -106,7 +106,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m dpa.realism.score",
         description="Score rollouts by the realism metric of the Waymo Open Sim Agents Challenge.",
-        epilog="A mean over scenarios comes with a 95 %% bootstrap interval. Exit status 2: an input cannot be used.",
+        epilog="A mean over scenarios comes with a 95 % bootstrap interval. Exit status 2: an input cannot be used.",
     )
     parser.add_argument("scenario", metavar="SCENARIO", help="TFRecord, serialized Scenario, .npz, folder, or store")
     parser.add_argument(
