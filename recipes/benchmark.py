@@ -9,7 +9,6 @@ Each case runs in a process of its own, so that its peak of memory is its own.
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import platform
 import resource
@@ -183,7 +182,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     machine = {"processor": platform.processor() or platform.machine(), "torch": torch.__version__}
     _print(rows, options)
     if out is not None:
-        write_json(out, json.loads(json.dumps({"options": options, "machine": machine, "rows": rows})))
+        write_json(out, {"options": options, "machine": machine, "rows": rows})
     return 0
 
 

@@ -18,23 +18,13 @@ from torch import Tensor
 
 from dpa.realism.submission import SubmissionReader, decode_rollouts
 from dpa.realism.tracks import HORIZON
-from envs.scene import CURRENT_STEP, LOG_STEPS, MapKind, Scene
-from envs.sources.recording import LightListing, Polyline, Recording
+from envs.scene import CURRENT_STEP, LOG_STEPS, Scene
+from envs.sources.recording import KIND_OF_FEATURE, LightListing, Polyline, Recording
 from envs.sources.womd import METRES_PER_SECOND_PER_MPH, read_womd
 from envs.store import MANIFEST_FILE, SceneStore
 
 ARRAYS = ".npz"
 _POSE = ("x", "y", "z", "heading")
-_MAP_KINDS = {
-    "lane": MapKind.LANE_UNDEFINED,
-    "road_line": MapKind.LINE_UNKNOWN,
-    "road_edge": MapKind.EDGE_UNKNOWN,
-    "stop_sign": MapKind.STOP_SIGN,
-    "crosswalk": MapKind.CROSSWALK,
-    "speed_bump": MapKind.SPEED_BUMP,
-    "driveway": MapKind.DRIVEWAY,
-}
-"""Map features of the arrays; the types of lanes, lines and edges count from these kinds on."""
 
 
 class Simulated(NamedTuple):
@@ -209,7 +199,7 @@ def scene_from_arrays(arrays: dict[str, np.ndarray], name: str) -> Scene:
             track_id=arrays["object_id"].tolist(),
             sdc=int(arrays["sdc_track_index"]),
             predict=arrays["tracks_to_predict"].tolist(),
-            polylines=[line for kind in _MAP_KINDS for line in _polylines(arrays, kind)],
+            polylines=[line for kind in KIND_OF_FEATURE for line in _polylines(arrays, kind)],
             lights=list(_lights(arrays)),
             **stacked,
         )
@@ -223,7 +213,7 @@ def scene_from_arrays(arrays: dict[str, np.ndarray], name: str) -> Scene:
 
 
 def _polylines(arrays: dict[str, np.ndarray], kind: str) -> Iterator[Polyline]:
-    points, ptr, first = arrays[f"{kind}_xyz"], arrays[f"{kind}_ptr"], int(_MAP_KINDS[kind])
+    points, ptr, first = arrays[f"{kind}_xyz"], arrays[f"{kind}_ptr"], int(KIND_OF_FEATURE[kind])
     types = arrays.get(f"{kind}_type", np.zeros(len(ptr) - 1, dtype=np.int64))
     limits = arrays.get(f"{kind}_speed_limit_mph", np.zeros(len(ptr) - 1)) * METRES_PER_SECOND_PER_MPH
     for row, feature_id in enumerate(arrays[f"{kind}_id"].tolist()):

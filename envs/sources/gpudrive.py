@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from envs.scene import LOG_STEPS, AgentKind, LightState, MapKind, Scene, SceneError
-from envs.sources.recording import LightListing, Polyline, Recording
+from envs.scene import LOG_STEPS, AgentKind, LightState, Scene, SceneError
+from envs.sources.recording import KIND_OF_FEATURE, LightListing, Polyline, Recording
 from envs.sources.source import Source, Unit, find_files
 
 _OPENERS = {".gz": gzip.open, ".xz": lzma.open}
@@ -28,16 +28,6 @@ _RADIANS_LIMIT = math.pi + 1e-3
 """No heading in radians is larger; the slack is for float32, whose pi is larger than pi."""
 _MOVING_SPEED = 1.0
 """Faster agents travel where they head [m/s]."""
-_KIND_OF_TYPE = {
-    "lane": MapKind.LANE_UNDEFINED,
-    "road_line": MapKind.LINE_UNKNOWN,
-    "road_edge": MapKind.EDGE_UNKNOWN,
-    "stop_sign": MapKind.STOP_SIGN,
-    "crosswalk": MapKind.CROSSWALK,
-    "speed_bump": MapKind.SPEED_BUMP,
-    "driveway": MapKind.DRIVEWAY,
-}
-"""Kinds for files without ``map_element_id``."""
 
 
 def read_gpudrive(path: str | Path) -> Scene:
@@ -119,7 +109,7 @@ def _radians(heading: np.ndarray, velocity: np.ndarray, valid: np.ndarray) -> np
 
 
 def _polyline(road: dict[str, Any], index: int) -> Polyline:
-    kind = road["map_element_id"] if "map_element_id" in road else _KIND_OF_TYPE[road["type"]]
+    kind = road["map_element_id"] if "map_element_id" in road else KIND_OF_FEATURE[road["type"]]
     return Polyline(road.get("id", index), kind, [(p["x"], p["y"], p["z"]) for p in road["geometry"]])
 
 

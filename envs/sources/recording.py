@@ -25,6 +25,17 @@ from envs.scene import (
     SceneError,
 )
 
+KIND_OF_FEATURE = {
+    "lane": MapKind.LANE_UNDEFINED,
+    "road_line": MapKind.LINE_UNKNOWN,
+    "road_edge": MapKind.EDGE_UNKNOWN,
+    "stop_sign": MapKind.STOP_SIGN,
+    "crosswalk": MapKind.CROSSWALK,
+    "speed_bump": MapKind.SPEED_BUMP,
+    "driveway": MapKind.DRIVEWAY,
+}
+"""WOMD's map features by name; the types of lanes, lines and edges count from these kinds on."""
+
 
 @dataclass(frozen=True)
 class Polyline:
