@@ -16,10 +16,10 @@ from dpa.policy.context import ContextOptions
 from dpa.policy.motionlm import MotionLM
 from dpa.tokens import TokenAction
 from dpa.training.batches import micro_batches
-from dpa.training.seeding import derive_seed
 from envs import keys
 from envs.geometry.ground import lift
 from envs.scene import CURRENT_STEP, Scene, SceneSource
+from envs.seeding import derive_seed
 from envs.traffic import TrafficEnv, largest_scene
 
 

@@ -9,7 +9,7 @@ and a store of a million are the same thing to the environment.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from enum import IntEnum
+from enum import IntEnum, IntFlag
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -93,6 +93,24 @@ class LightState(IntEnum):
     GO = 6
     FLASHING_STOP = 7
     FLASHING_CAUTION = 8
+
+
+class Lacks(IntFlag):
+    """What a recording does not have; a model or a metric that needs it must not take the stand-in for data."""
+
+    NOTHING = 0
+    HEIGHT = 1
+    """No z of agents: they stand on the map, or on z = 0."""
+    SIZES = 2
+    """No boxes: agents have the size of their class."""
+    LIGHTS = 4
+    """No traffic lights, which does not mean that there were none."""
+    TOPOLOGY = 8
+    """No links between lanes."""
+    SPEED_LIMITS = 16
+    """No speed limits of lanes."""
+    TARGETS = 32
+    """No agents marked for prediction."""
 
 
 class Agents(TensorClass["nocast"]):
@@ -203,6 +221,7 @@ class Scene(TensorClass["nocast"]):
         road: :class:`RoadMap`.
         lights: :class:`Lights`.
         origin: ``[*, 3]`` float64, what was subtracted from the source's coordinates [m].
+        lacks: ``[*]`` int64, flags of :class:`Lacks`.
         scene_id: the recording's id (a list of them once collated).
 
     Examples:
@@ -218,6 +237,7 @@ class Scene(TensorClass["nocast"]):
     road: RoadMap
     lights: Lights
     origin: Tensor
+    lacks: Tensor
     scene_id: str
 
     def validate(self, name: str | None = None) -> Scene:
@@ -228,41 +248,68 @@ class Scene(TensorClass["nocast"]):
 
         Raises:
             SceneError: no SDC, no agent at the current step, no road edge, a value that is not finite, or fields whose
-                sizes disagree. The message names the scene and the fix.
+                sizes disagree. The message names the scene, the field and the fix.
         """
         name = f"{name} (scene {self.scene_id})" if name else f"scene {self.scene_id}"
-        agents, road = self.agents, self.road
-        num_agents = agents.position.shape[0]
-        if agents.position.shape != (num_agents, LOG_STEPS, 3) or agents.valid.shape != (num_agents, LOG_STEPS):
-            raise SceneError(
-                f"{name}: tracks must have {LOG_STEPS} steps of 0.1 s, got positions of shape "
-                f"{tuple(agents.position.shape)}. Cut or resample the recording."
-            )
-        if int(agents.sdc.sum()) != 1:
-            raise SceneError(f"{name}: {int(agents.sdc.sum())} agents are marked as SDC; mark exactly one.")
-        if not agents.present.any():
-            raise SceneError(f"{name}: no agent is valid at the current step {CURRENT_STEP}; leave the scene out.")
-        if not agents.present[agents.sdc].all():
-            raise SceneError(f"{name}: the SDC is not valid at the current step {CURRENT_STEP}; leave the scene out.")
-        for field in ("position", "heading", "velocity"):
-            values = getattr(agents, field)[agents.valid]
-            if not torch.isfinite(values).all():
-                bad = values[~torch.isfinite(values)][0].item()
-                agent = int((~torch.isfinite(getattr(agents, field)).flatten(1).all(1)).nonzero()[0])
-                raise SceneError(
-                    f"{name}: track {int(agents.track_id[agent])} has {field} {bad} at a valid step; mark it invalid."
-                )
-        if not (agents.extent[agents.present] > 0).all():
-            raise SceneError(
-                f"{name}: an agent at the current step has an extent (length, width, height) that is not positive; "
-                "give its box, or mark it invalid."
-            )
-        if not torch.isfinite(road.points).all():
-            raise SceneError(f"{name}: a map point is not finite; remove the polyline.")
-        edges = torch.isin(road.kind, torch.tensor(EDGE_KINDS)) & (road.count >= 2)
-        if not edges.any():
-            raise SceneError(f"{name}: the map has no road edge of two points or more; off-road is undefined.")
+        _check_tracks(self.agents, name)
+        _check_map(self.road, name)
+        _check_finite(name, self.lights.lane_id, "light of lane", stop_point=self.lights.stop_point)
         return self
+
+
+def _check_tracks(agents: Agents, name: str) -> None:
+    num_agents = agents.position.shape[0]
+    if agents.position.shape != (num_agents, LOG_STEPS, 3) or agents.valid.shape != (num_agents, LOG_STEPS):
+        raise SceneError(
+            f"{name}: tracks must have {LOG_STEPS} steps of 0.1 s, got positions of shape "
+            f"{tuple(agents.position.shape)}. Cut or resample the recording."
+        )
+    if int(agents.sdc.sum()) != 1:
+        raise SceneError(f"{name}: {int(agents.sdc.sum())} agents are marked as SDC; mark exactly one.")
+    if not agents.present.any():
+        raise SceneError(f"{name}: no agent is valid at the current step {CURRENT_STEP}; leave the scene out.")
+    if not agents.present[agents.sdc].all():
+        raise SceneError(f"{name}: the SDC is not valid at the current step {CURRENT_STEP}; leave the scene out.")
+    for field in ("position", "heading", "velocity"):
+        values = getattr(agents, field)
+        shown = torch.where(agents.valid.reshape(agents.valid.shape + (1,) * (values.ndim - 2)), values, 0.0)
+        _check_finite(name, agents.track_id, "track", **{field: shown})
+    _check_finite(name, agents.track_id, "track", extent=agents.extent)
+    flat = agents.present & ~(agents.extent > 0).all(-1)
+    if flat.any():
+        agent = int(flat.nonzero()[0])
+        raise SceneError(
+            f"{name}: track {int(agents.track_id[agent])} has the extent {agents.extent[agent].tolist()} at the "
+            "current step (length, width, height), which must be positive; give its box, or mark it invalid."
+        )
+
+
+def _check_map(road: RoadMap, name: str) -> None:
+    if not torch.equal(road.start, road.count.cumsum(0) - road.count) or int(road.count.sum()) != len(road.points):
+        raise SceneError(f"{name}: the points of the polylines must lie behind each other, in the polylines' order.")
+    if not torch.isfinite(road.points).all():
+        point = int((~torch.isfinite(road.points)).any(-1).nonzero()[0])
+        line = int(torch.searchsorted(road.start + road.count, point, right=True))
+        raise SceneError(
+            f"{name}: map feature {int(road.feature_id[line])} has the point {road.points[point].tolist()}, which is "
+            "not finite in float32; remove the polyline."
+        )
+    _check_finite(name, road.feature_id, "map feature", speed_limit=road.speed_limit)
+    edges = torch.isin(road.kind, torch.tensor(EDGE_KINDS)) & (road.count >= 2)
+    if not edges.any():
+        raise SceneError(f"{name}: the map has no road edge of two points or more; off-road is undefined.")
+
+
+def _check_finite(name: str, ids: Tensor, what: str, **fields: Tensor) -> None:
+    for field, values in fields.items():
+        good = torch.isfinite(values)
+        if not good.all():
+            row = int((~good).flatten(1).any(1).nonzero()[0]) if values.ndim > 1 else int((~good).nonzero()[0])
+            bad = values[~good][0].item()
+            raise SceneError(
+                f"{name}: {what} {int(ids[row])} has {field} {bad} (in float32), which is not finite; mark it invalid "
+                "or leave it out."
+            )
 
 
 @runtime_checkable
@@ -316,6 +363,7 @@ def collate(scenes: Sequence[Scene]) -> Scene:
         road=pad("road", RoadMap, {"feature_id": -1, "links": -1}),
         lights=pad("lights", Lights, {"lane_id": -1, "state": LightState.ABSENT}),
         origin=torch.stack([scene.origin for scene in scenes]),
+        lacks=torch.stack([scene.lacks for scene in scenes]),
         scene_id=[scene.scene_id for scene in scenes],
         batch_size=size,
     )

@@ -16,16 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from envs.scene import Scene, SceneError
-from envs.shards import (
-    FORMAT_VERSION,
-    RECORD_FILE,
-    Shard,
-    file_digest,
-    read_record,
-    read_versioned,
-    write_json,
-)
+from envs.scene import Lacks, Scene, SceneError
+from envs.shards import FORMAT_VERSION, Shard, file_digest, read_versioned, write_json
 
 MANIFEST_FILE = "manifest.json"
 """In the folder of a store: its :class:`Manifest`."""
@@ -40,8 +32,9 @@ class Manifest:
         options: how they were converted.
         plan: digest of the inputs and their order; a conversion goes on only with its own plan.
         complete: every shard is there.
-        shards: ``name``, number of ``scenes`` and ``sha256`` of the record of each shard, in order.
-        skipped: inputs that gave no scene: ``input``, ``record`` and ``error``.
+        shards: ``name``, number of ``scenes`` and ``sha256`` of the file of each shard, in order.
+        skipped: records that gave no scene: ``input``, ``record`` and ``error``.
+        notes: what readers could not take over as it was -> how often.
     """
 
     source: str
@@ -50,6 +43,7 @@ class Manifest:
     complete: bool = False
     shards: list[dict[str, Any]] = field(default_factory=list)
     skipped: list[dict[str, Any]] = field(default_factory=list)
+    notes: dict[str, int] = field(default_factory=dict)
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
@@ -67,57 +61,59 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 class SceneStore:
-    """Read-only scenes of a folder that ``python -m envs.convert`` has written.
+    """Read-only scenes of one or more folders that ``python -m envs.convert`` has written.
 
-    Every scene that is handed out is a copy: it may be changed in place, the files stay as they are. Files are mapped
-    on first use and never written, so that any number of processes may read one store; a pickled store is its
-    folder's name and opens again where it arrives.
+    Every scene that is handed out is a copy: it may be changed in place, the files stay as they are. No file stays open
+    between two scenes, so that any number of processes may read one store; a pickled store is its folders' names and
+    opens again where it arrives.
 
     Args:
-        folder: of the store.
+        folders: of the stores; their scenes follow one another.
 
     Attributes:
-        folder: of the store, absolute.
-        manifest: what the store is made of.
+        folders: of the stores, absolute.
+        manifests: what each is made of.
 
     Raises:
-        SceneError: no store, another version, an unfinished conversion, or a shard that is missing; on loading, an
-            array that is missing or has the wrong size.
+        SceneError: no store, another version, an unfinished conversion, a shard that is missing, or two scenes of one
+            id; on loading, a scene that is damaged.
 
     Examples:
         >>> from tempfile import TemporaryDirectory
-        >>> from envs.shards import write_shard
+        >>> from envs.shards import ShardWriter
         >>> from envs.sources.synthetic import straight_road
         >>> folder = TemporaryDirectory()
-        >>> path = Path(folder.name)
-        >>> record = write_shard(path / "00000", [straight_road(2), straight_road(3)], [("none", 0), ("none", 1)])
-        >>> shards = [{"name": "00000", "scenes": 2, "sha256": file_digest(path / "00000" / "shard.json")}]
-        >>> write_manifest(path, Manifest("synthetic", {}, plan="", complete=True, shards=shards))
+        >>> path, writer = Path(folder.name), ShardWriter()
+        >>> writer.add(straight_road(2), ("none", 0))
+        >>> writer.add(straight_road(3), ("none", 1))
+        >>> record = writer.write(path / "00000.scenes")
+        >>> shards = [{"name": "00000.scenes", "scenes": 2, "sha256": file_digest(path / "00000.scenes")}]
+        >>> write_manifest(path, Manifest("synthetic", {"split": "train"}, plan="", complete=True, shards=shards))
         >>> store = SceneStore(path)
         >>> len(store), store.num_agents, store[1].agents.position.shape
         (2, array([2, 3]), torch.Size([3, 91, 3]))
-        >>> store.subset([1]).scene_ids
-        ['straight_road_3_None']
+        >>> store.subset([1]).scene_ids, store.select(max_agents=2).scene_ids
+        (['straight_road_3_None'], ['straight_road_2_None'])
         >>> folder.cleanup()
     """
 
-    def __init__(self, folder: str | Path) -> None:
-        self.folder = Path(folder).absolute()
-        self.manifest = read_manifest(self.folder)
-        if not self.manifest.complete:
-            raise SceneError(f"{self.folder}: the conversion has not finished; run it again, it goes on where it was.")
-        self._shards = [self._open(entry["name"], entry["scenes"]) for entry in self.manifest.shards]
+    def __init__(self, *folders: str | Path) -> None:
+        if not folders:
+            raise SceneError("a store needs a folder; give one that `python -m envs.convert` has written.")
+        self.folders = tuple(Path(folder).absolute() for folder in folders)
+        self.manifests = tuple(read_manifest(folder) for folder in self.folders)
+        self._shards: list[Shard] = []
+        self._owner: list[int] = []
+        for number, (folder, manifest) in enumerate(zip(self.folders, self.manifests, strict=True)):
+            if not manifest.complete:
+                raise SceneError(f"{folder}: the conversion has not finished; run it again, it goes on where it was.")
+            self._shards += [_open(folder, entry) for entry in manifest.shards]
+            self._owner += [number] * len(manifest.shards)
         self._starts = [0, *accumulate(len(shard.record.scene_ids) for shard in self._shards)]
         self._rows = np.arange(self._starts[-1])
-
-    def _open(self, name: str, num_scenes: int) -> Shard:
-        shard = Shard(self.folder / name, read_record(self.folder / name))
-        if len(shard.record.scene_ids) != num_scenes:
-            raise SceneError(
-                f"{shard.folder}: {len(shard.record.scene_ids)} scenes where the manifest has {num_scenes}; "
-                "convert the scenes again."
-            )
-        return shard
+        if len(self.folders) > 1 and len(self._index) < len(self):
+            twice = next(scene_id for i, scene_id in enumerate(self.scene_ids) if self._index[scene_id] != i)
+            raise SceneError(f"{', '.join(map(str, self.folders))}: share scene {twice}; leave one folder out.")
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -128,10 +124,10 @@ class SceneStore:
         return shard.scene(row)
 
     def __repr__(self) -> str:
-        return f"SceneStore({str(self.folder)!r}, {len(self)} scenes)"
+        return f"SceneStore({', '.join(repr(str(folder)) for folder in self.folders)}: {len(self)} scenes)"
 
     def __reduce__(self) -> tuple:
-        return _reopen, (self.folder, self._rows)
+        return _reopen, (self.folders, self._rows)
 
     @cached_property
     def scene_ids(self) -> list[str]:
@@ -139,11 +135,27 @@ class SceneStore:
         ids = [scene_id for shard in self._shards for scene_id in shard.record.scene_ids]
         return [ids[row] for row in self._rows]
 
-    @cached_property
+    @property
     def num_agents(self) -> np.ndarray:
         """``[len]`` int64: agents of each scene that are present at the current step."""
-        counts = [count for shard in self._shards for count in shard.record.num_agents]
-        return np.array(counts, dtype=np.int64)[self._rows]
+        return self._gather("num_agents", np.int64)
+
+    @property
+    def has_lights(self) -> np.ndarray:
+        """``[len]`` bool: whether each scene has a traffic light."""
+        return self._gather("has_lights", np.bool_)
+
+    @property
+    def lacks(self) -> np.ndarray:
+        """``[len]`` int64: flags of :class:`~envs.scene.Lacks` of each scene."""
+        return self._gather("lacks", np.int64)
+
+    @property
+    def blocks(self) -> list[int]:
+        """Numbers of consecutive indices whose scenes lie in one file: reading them together is cheap."""
+        shards = np.searchsorted(self._starts, self._rows, side="right")
+        borders = np.flatnonzero(np.diff(shards)) + 1
+        return np.diff(np.concatenate(([0], borders, [len(shards)]))).tolist() if len(shards) else []
 
     def index_of(self, scene_id: str) -> int:
         """Index of a scene.
@@ -152,7 +164,7 @@ class SceneStore:
             SceneError: the store has no scene of that id.
         """
         if scene_id not in self._index:
-            raise SceneError(f"{self.folder}: no scene {scene_id!r} among its {len(self)}; see scene_ids.")
+            raise SceneError(f"{self!r}: no scene {scene_id!r} among its {len(self)}; see scene_ids.")
         return self._index[scene_id]
 
     def find(self, name: str) -> int:
@@ -172,19 +184,56 @@ class SceneStore:
             IndexError: an index out of range.
         """
         view = object.__new__(SceneStore)
-        view.folder, view.manifest = self.folder, self.manifest
-        view._shards, view._starts = self._shards, self._starts
+        view.folders, view.manifests = self.folders, self.manifests
+        view._shards, view._starts, view._owner = self._shards, self._starts, self._owner
         view._rows = self._rows[np.asarray(indices, dtype=np.int64)]
         return view
+
+    def select(
+        self,
+        *,
+        min_agents: int = 0,
+        max_agents: int | None = None,
+        has_lights: bool | None = None,
+        source: str | None = None,
+        split: str | None = None,
+        without: Lacks = Lacks.NOTHING,
+    ) -> SceneStore:
+        """A view of the scenes that fit, in their order; nothing is unpacked to tell.
+
+        Args:
+            min_agents: fewest agents at the current step.
+            max_agents: most agents at the current step.
+            has_lights: with traffic lights, or without.
+            source: name of the source that they came from.
+            split: name that their conversion was given.
+            without: nothing of this may be lacking, for example ``Lacks.LIGHTS | Lacks.TOPOLOGY``.
+
+        Raises:
+            ValueError: no folder has that source or split; the message names those there are.
+        """
+        fits = (self.num_agents >= min_agents) & (self.lacks & int(without) == 0)
+        if max_agents is not None:
+            fits &= self.num_agents <= max_agents
+        if has_lights is not None:
+            fits &= self.has_lights == has_lights
+        for what, wanted, names in (
+            ("source", source, [manifest.source for manifest in self.manifests]),
+            ("split", split, [manifest.options.get("split", "") for manifest in self.manifests]),
+        ):
+            if wanted is not None:
+                if wanted not in names:
+                    raise ValueError(f"{self!r}: no {what} {wanted!r}; there is {', '.join(map(repr, names))}.")
+                fits &= np.array([name == wanted for name in names])[self._folder_of_rows]
+        return self.subset(np.flatnonzero(fits))
 
     def provenance(self, index: int) -> tuple[str, int]:
         """The input (a file) that a scene came from, and its record there."""
         shard, row = self._find(index)
-        name, record = shard.record.units[row]
-        return name, record
+        return shard.record.units[row]
 
     def verify(self, tick: Callable[[], None] = lambda: None) -> None:
-        """Compare every file with its checksum and validate every scene, of the whole store.
+        """Compare every file with its checksum, unpack and validate every scene, of the whole store.
 
         Args:
             tick: called after each scene.
@@ -192,12 +241,10 @@ class SceneStore:
         Raises:
             SceneError: naming the first file or scene that is not as it was written.
         """
-        for entry, shard in zip(self.manifest.shards, self._shards, strict=True):
-            if file_digest(shard.folder / RECORD_FILE) != entry["sha256"]:
-                raise SceneError(
-                    f"{shard.folder / RECORD_FILE}: changed since it was written; convert the scenes again."
-                )
-            shard.verify()
+        entries = [entry for manifest in self.manifests for entry in manifest.shards]
+        for entry, shard in zip(entries, self._shards, strict=True):
+            if file_digest(shard.path) != entry["sha256"]:
+                raise SceneError(f"{shard.path}: changed since it was written; convert the scenes again.")
             for row, (name, record) in enumerate(shard.record.units):
                 shard.scene(row).validate(f"{name}, record {record}")
                 tick()
@@ -205,6 +252,14 @@ class SceneStore:
     @cached_property
     def _index(self) -> dict[str, int]:
         return {scene_id: index for index, scene_id in enumerate(self.scene_ids)}
+
+    @property
+    def _folder_of_rows(self) -> np.ndarray:
+        return np.array(self._owner)[np.searchsorted(self._starts, self._rows, side="right") - 1]
+
+    def _gather(self, field: str, dtype: type) -> np.ndarray:
+        values = [value for shard in self._shards for value in getattr(shard.record, field)]
+        return np.array(values, dtype=dtype)[self._rows]
 
     def _find(self, index: int) -> tuple[Shard, int]:
         if not -len(self) <= index < len(self):
@@ -214,5 +269,15 @@ class SceneStore:
         return self._shards[number], row - self._starts[number]
 
 
-def _reopen(folder: Path, rows: np.ndarray) -> SceneStore:
-    return SceneStore(folder).subset(rows)
+def _open(folder: Path, entry: dict[str, Any]) -> Shard:
+    shard = Shard(folder / entry["name"])
+    if len(shard.record.scene_ids) != entry["scenes"]:
+        raise SceneError(
+            f"{shard.path}: {len(shard.record.scene_ids)} scenes where the manifest has {entry['scenes']}; "
+            "convert the scenes again."
+        )
+    return shard
+
+
+def _reopen(folders: tuple[Path, ...], rows: np.ndarray) -> SceneStore:
+    return SceneStore(*folders).subset(rows)

@@ -24,8 +24,9 @@ from dpa.report.figures import read_curves
 from dpa.training.batches import Item, ShuffledOrder, collate_items, micro_batches
 from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
 from dpa.training.run import Run
-from dpa.training.seeding import make_generator, seed_everything
+from dpa.training.seeding import seed_everything
 from envs import keys
+from envs.seeding import make_generator
 from envs.store import SceneStore
 from recipes.candidates import Group, make_candidates
 from recipes.cli import CONFIG, build, check_steps, finished, finite, plain, recipe, write_json

@@ -13,9 +13,9 @@ from dpa.policy.actor import Contexts
 from dpa.preferences import PreferenceStore, nearest, nearest_farthest, random_rollouts
 from dpa.tokens import MotionTokenizer
 from dpa.training.batches import log_item
-from dpa.training.seeding import make_generator
 from envs import keys
 from envs.scene import SceneSource
+from envs.seeding import make_generator
 
 
 class Group(NamedTuple):

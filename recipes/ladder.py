@@ -24,10 +24,11 @@ from dpa.realism import realism
 from dpa.report.statistics import summary
 from dpa.rollout import Decoding, collect_groups, lifted, simulated_poses
 from dpa.tokens import MotionTokenizer
-from dpa.training.seeding import make_generator, seed_everything
+from dpa.training.seeding import seed_everything
 from envs import keys
 from envs.progress import progress
 from envs.scene import CURRENT_STEP, STEP_SECONDS, Scene, SceneSource
+from envs.seeding import make_generator
 from recipes.cli import CONFIG, build, finished, plain, recipe, write_json
 from recipes.models import build_policy, context_options, open_policy, policy_config, weights_digest
 from recipes.play import named

@@ -22,11 +22,12 @@ from dpa.policy import MotionLM, make_context
 from dpa.training.batches import Item, ShuffledOrder, collate_items, crop_agents, log_item, micro_batches
 from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
 from dpa.training.run import Run
-from dpa.training.seeding import make_generator, seed_everything
+from dpa.training.seeding import seed_everything
 from envs import keys
 from envs.augment import mirror
 from envs.progress import progress
 from envs.scene import SceneSource
+from envs.seeding import make_generator
 from recipes.cli import CONFIG, check_steps, finished, plain, recipe, write_json
 from recipes.models import build_policy, context_options, policy_config, write_policy
 from recipes.scenes import Splits, fingerprint, open_splits

@@ -9,8 +9,9 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig, ListConfig
 
-from dpa.training.seeding import make_generator
 from envs.convert import convert
+from envs.seeding import make_generator
+from envs.shards import FORMAT_VERSION
 from envs.store import SceneStore
 
 
@@ -71,9 +72,7 @@ def fingerprint(scenes: SceneStore) -> str:
 def _open(cfg: DictConfig, paths: str | ListConfig) -> SceneStore:
     inputs = [paths] if isinstance(paths, str) else list(paths)
     if cfg.source == "store":
-        if len(inputs) != 1:
-            raise ValueError(f"scenes.source=store takes one folder for each split, got {inputs}.")
-        return SceneStore(inputs[0])
-    name = hashlib.sha256("\n".join([cfg.source, *inputs]).encode()).hexdigest()[:12]
+        return SceneStore(*inputs)
+    name = hashlib.sha256("\n".join([f"{cfg.source} {FORMAT_VERSION}", *inputs]).encode()).hexdigest()[:12]
     folder = Path(cfg.cache) / f"{cfg.source}_{name}"
     return convert(cfg.source, inputs, folder, workers=cfg.workers, shard_size=cfg.shard_size, show_progress=True)

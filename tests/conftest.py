@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from envs.scene import Scene
-from envs.shards import file_digest, write_shard
+from envs.shards import ShardWriter, file_digest
 from envs.store import Manifest, write_manifest
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -25,15 +25,19 @@ def shared() -> Path:
 
 
 @pytest.fixture(scope="session")
-def write_store() -> Callable[[Path, list[Scene]], Path]:
-    """Writes scenes to a new folder as a store of one shard."""
+def write_store() -> Callable[..., Path]:
+    """Writes a store by hand to a folder, one shard for each list of scenes."""
 
-    def write(folder: Path, scenes: list[Scene]) -> Path:
-        folder.mkdir(parents=True)
-        write_shard(folder / "00000", scenes, [("made", row) for row in range(len(scenes))])
-        digest = file_digest(folder / "00000" / "shard.json")
-        shards = [{"name": "00000", "scenes": len(scenes), "sha256": digest}]
-        write_manifest(folder, Manifest("made", {}, "", complete=True, shards=shards))
+    def write(folder: Path, *shards: list[Scene], source: str = "made", split: str = "") -> Path:
+        folder.mkdir(parents=True, exist_ok=True)
+        entries = []
+        for number, scenes in enumerate(shards):
+            writer, path = ShardWriter(), folder / f"{number:05d}.scenes"
+            for row, scene in enumerate(scenes):
+                writer.add(scene, ("made", row))
+            writer.write(path)
+            entries.append({"name": path.name, "scenes": len(scenes), "sha256": file_digest(path)})
+        write_manifest(folder, Manifest(source, {"split": split}, "", complete=True, shards=entries))
         return folder
 
     return write

@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 
 from dpa.ranking import AGGREGATES, FEATURES, SOLVERS
 from envs import keys
-from envs.convert import _parser as convert_parser
+from envs.convert.__main__ import make_parser as convert_parser
 from envs.sources import SOURCES
 from envs.sources.sumo import parse, units
 from recipes.align import LOSSES

@@ -8,6 +8,7 @@ a submission of the challenge.
 from __future__ import annotations
 
 import zipfile
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +20,16 @@ from torch import Tensor
 from dpa.realism.submission import SubmissionReader, decode_rollouts
 from dpa.realism.tracks import HORIZON
 from envs.scene import CURRENT_STEP, LOG_STEPS, Scene
-from envs.sources.recording import KIND_OF_FEATURE, LightListing, Polyline, Recording
+from envs.sources.recording import (
+    KIND_OF_FEATURE,
+    LightListing,
+    Polyline,
+    Recording,
+    agent_kind,
+    light_state,
+    map_kind,
+)
+from envs.sources.source import Notes
 from envs.sources.womd import METRES_PER_SECOND_PER_MPH, read_womd
 from envs.store import MANIFEST_FILE, SceneStore
 
@@ -185,6 +195,7 @@ def scene_from_arrays(arrays: dict[str, np.ndarray], name: str) -> Scene:
     Raises:
         ValueError: an array is missing or of another shape (also SceneError, a ValueError).
     """
+    notes: Notes = Counter()
     try:
         stacked = {
             "position": np.stack([arrays[key] for key in ("x", "y", "z")], -1).astype(np.float64),
@@ -195,16 +206,18 @@ def scene_from_arrays(arrays: dict[str, np.ndarray], name: str) -> Scene:
             scene_id=str(arrays["scenario_id"]),
             heading=arrays["heading"],
             valid=arrays["valid"],
-            kind=arrays["object_type"].tolist(),
+            kind=[agent_kind(number, notes) for number in arrays["object_type"].tolist()],
             track_id=arrays["object_id"].tolist(),
             sdc=int(arrays["sdc_track_index"]),
             predict=arrays["tracks_to_predict"].tolist(),
-            polylines=[line for kind in KIND_OF_FEATURE for line in _polylines(arrays, kind)],
-            lights=list(_lights(arrays)),
+            polylines=[line for kind in KIND_OF_FEATURE for line in _polylines(arrays, kind, notes)],
+            lights=list(_lights(arrays, notes)),
             **stacked,
         )
         if recording.position.shape[1:] != (LOG_STEPS, 3) or int(arrays["current_time_index"]) != CURRENT_STEP:
             raise ValueError(f"tracks must have {LOG_STEPS} steps and step {CURRENT_STEP} as the current one")
+        if notes:
+            raise ValueError("; ".join(notes))
     except (KeyError, IndexError, TypeError) as error:
         raise ValueError(f"{name} is no scenario of arrays: {error}; write it again.") from error
     except ValueError as error:
@@ -212,20 +225,21 @@ def scene_from_arrays(arrays: dict[str, np.ndarray], name: str) -> Scene:
     return recording.to_scene(name).validate(name)
 
 
-def _polylines(arrays: dict[str, np.ndarray], kind: str) -> Iterator[Polyline]:
-    points, ptr, first = arrays[f"{kind}_xyz"], arrays[f"{kind}_ptr"], int(KIND_OF_FEATURE[kind])
-    types = arrays.get(f"{kind}_type", np.zeros(len(ptr) - 1, dtype=np.int64))
-    limits = arrays.get(f"{kind}_speed_limit_mph", np.zeros(len(ptr) - 1)) * METRES_PER_SECOND_PER_MPH
-    for row, feature_id in enumerate(arrays[f"{kind}_id"].tolist()):
-        yield Polyline(feature_id, first + int(types[row]), points[ptr[row] : ptr[row + 1]], float(limits[row]))
+def _polylines(arrays: dict[str, np.ndarray], feature: str, notes: Notes) -> Iterator[Polyline]:
+    points, ptr, types = arrays[f"{feature}_xyz"], arrays[f"{feature}_ptr"], arrays.get(f"{feature}_type")
+    limits = arrays.get(f"{feature}_speed_limit_mph", np.zeros(len(ptr) - 1)) * METRES_PER_SECOND_PER_MPH
+    for row, feature_id in enumerate(arrays[f"{feature}_id"].tolist()):
+        kind = KIND_OF_FEATURE[feature] if types is None else map_kind(feature, int(types[row]), notes)
+        yield Polyline(feature_id, kind, points[ptr[row] : ptr[row + 1]], float(limits[row]))
 
 
-def _lights(arrays: dict[str, np.ndarray]) -> Iterator[LightListing]:
+def _lights(arrays: dict[str, np.ndarray], notes: Notes) -> Iterator[LightListing]:
     ptr = arrays["tl_ptr"]
     for step in range(len(ptr) - 1):
         for row in range(ptr[step], ptr[step + 1]):
             stop = tuple(arrays["tl_stop_point"][row].tolist())
-            yield LightListing(step, int(arrays["tl_lane_id"][row]), int(arrays["tl_state"][row]), stop)
+            state = light_state(int(arrays["tl_state"][row]), notes)
+            yield LightListing(step, int(arrays["tl_lane_id"][row]), state, stop)
 
 
 def _load(path: Path) -> dict[str, Any]:

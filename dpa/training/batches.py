@@ -12,8 +12,8 @@ from torch.nn import functional as F
 
 from dpa.policy.context import SceneContext, collate_contexts, keep_agents
 from dpa.tokens.base import MotionTokenizer
-from dpa.training.seeding import make_generator
 from envs import keys
+from envs.seeding import make_generator
 
 
 class Item(NamedTuple):

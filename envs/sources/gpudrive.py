@@ -8,22 +8,28 @@ prediction, and some files give map features no id and no exact kind. Neither ha
 from __future__ import annotations
 
 import gzip
-import json
+import io
 import lzma
 import math
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from envs.scene import LOG_STEPS, AgentKind, LightState, Scene, SceneError
+from envs.scene import LOG_STEPS, AgentKind, Lacks, LightState, MapKind, Scene, SceneError
+from envs.sources.fields import Field, decode_json
+from envs.sources.files import find_files, read_file
 from envs.sources.recording import KIND_OF_FEATURE, LightListing, Polyline, Recording
-from envs.sources.source import Source, Unit, find_files
+from envs.sources.source import Notes, Record, Source
 
+MAX_BYTES = 1 << 26
+"""Of an unpacked file; a scene has about 5 MB, and decoded JSON takes up to twenty times its size in memory."""
 _OPENERS = {".gz": gzip.open, ".xz": lzma.open}
+_LACKS = Lacks.TOPOLOGY | Lacks.SPEED_LIMITS
 _RADIANS_LIMIT = math.pi + 1e-3
 """No heading in radians is larger; the slack is for float32, whose pi is larger than pi."""
 _MOVING_SPEED = 1.0
@@ -47,50 +53,71 @@ def read_gpudrive(path: str | Path) -> Scene:
         ...     read_gpudrive(path)
         Traceback (most recent call last):
         ...
-        envs.scene.SceneError: ...scene.json, record 0: the entry 'objects' is missing; ...
+        envs.scene.SceneError: ...scene.json, record 0: objects is missing; ...
     """
     return next(GPUDRIVE.scenes(str(path)))
 
 
-def scene_from_json(data: dict[str, Any], name: str) -> Scene:
+def scene_from_json(top: Field, notes: Notes | None = None) -> Scene:
     """One decoded file -> scene.
 
     Args:
-        data: what the JSON holds.
-        name: what errors call it.
+        top: what the JSON holds.
+        notes: counts classes, types and states that are not known.
     """
-    objects, roads = data["objects"], data["roads"]
-    if not objects:
-        raise SceneError(f"{name}: it has no objects; leave the scene out.")
-    _check_steps(objects, name)
-    valid = np.array([item["valid"] for item in objects], dtype=bool)
-    metadata = data.get("metadata", {"sdc_track_index": len(objects) - 1, "tracks_to_predict": []})
-    size = np.array([[item["length"], item["width"], item["height"]] for item in objects], dtype=np.float64)
-    velocity = np.array([[(v["x"], v["y"]) for v in item["velocity"]] for item in objects])
+    notes = Counter() if notes is None else notes
+    objects = top["objects"].items(at_least=1)
+    valid = np.array([_steps(item, "valid", Field.flag) for item in objects])
+    velocity = np.stack([_table(item, "velocity", "x", "y") for item in objects])
+    heading = np.array([_steps(item, "heading", partial(Field.number, finite=False)) for item in objects])
+    extent = np.array([[item[side].number() for side in ("length", "width", "height")] for item in objects])
+    metadata = top.get("metadata")
     return Recording(
-        scene_id=data["scenario_id"],
-        position=np.array([[(p["x"], p["y"], p["z"]) for p in item["position"]] for item in objects]),
-        heading=_radians(np.array([item["heading"] for item in objects]), velocity, valid),
+        scene_id=top["scenario_id"].text(),
+        position=np.stack([_table(item, "position", "x", "y", "z") for item in objects]),
+        heading=_radians(heading, velocity, valid),
         velocity=velocity,
-        extent=np.broadcast_to(size[:, None], (len(objects), LOG_STEPS, 3)),
+        extent=np.broadcast_to(extent[:, None], (len(objects), LOG_STEPS, 3)),
         valid=valid,
-        kind=[_named(AgentKind, item["type"], "object type", name) for item in objects],
-        track_id=[item.get("id", index) for index, item in enumerate(objects)],
-        sdc=metadata["sdc_track_index"],
-        predict=[track["track_index"] for track in metadata["tracks_to_predict"]],
-        polylines=[_polyline(road, index) for index, road in enumerate(roads)],
-        lights=_lights(data["tl_states"], name),
-    ).to_scene(name)
+        kind=[_agent_kind(item["type"], notes) for item in objects],
+        track_id=[_id(item, index) for index, item in enumerate(objects)],
+        sdc=len(objects) - 1 if metadata is None else metadata["sdc_track_index"].integer(),
+        predict=[] if metadata is None else _predicted(metadata),
+        polylines=[_polyline(road, index, notes) for index, road in enumerate(top["roads"].items())],
+        lights=[listing for light in top["tl_states"].entries() for listing in _listings(light, notes)],
+        lacks=_LACKS | (Lacks.TARGETS if metadata is None else Lacks.NOTHING),
+    ).to_scene(top.name)
 
 
-def _check_steps(objects: list[dict[str, Any]], name: str) -> None:
-    for index, item in enumerate(objects):
-        for field in ("position", "heading", "velocity", "valid"):
-            if len(item[field]) != LOG_STEPS:
-                raise SceneError(
-                    f"{name}: object {index} has {len(item[field])} steps of {field} where {LOG_STEPS} are needed; "
-                    "convert a split with the whole 9.1 s."
-                )
+def _steps(item: Field, key: str, read: Any) -> list:
+    """One value for each step."""
+    values = item[key].items()
+    _check_steps(item[key], len(values))
+    return [read(value) for value in values]
+
+
+def _table(item: Field, key: str, *columns: str) -> np.ndarray:
+    """``[L, columns]``; what is not finite must lie at an invalid step, which the scene checks."""
+    table = item[key].table(*columns, finite=False)
+    _check_steps(item[key], len(table))
+    return table
+
+
+def _check_steps(field: Field, count: int) -> None:
+    if count != LOG_STEPS:
+        raise SceneError(
+            f"{field.name}: {field.path} has {count} steps where {LOG_STEPS} are needed; convert a split with the "
+            "whole 9.1 s."
+        )
+
+
+def _id(item: Field, index: int) -> int:
+    own = item.get("id")
+    return index if own is None else own.integer(lowest=-(2**62))
+
+
+def _predicted(metadata: Field) -> list[int]:
+    return [track["track_index"].integer() for track in metadata["tracks_to_predict"].items()]
 
 
 def _radians(heading: np.ndarray, velocity: np.ndarray, valid: np.ndarray) -> np.ndarray:
@@ -99,58 +126,87 @@ def _radians(heading: np.ndarray, velocity: np.ndarray, valid: np.ndarray) -> np
     A heading beyond pi says degrees. WOMD's own headings can pass pi too (they are not wrapped), so a file with such
     headings is taken for radians after all where the directions of travel fit radians better.
     """
-    if not (np.abs(heading[valid]) > _RADIANS_LIMIT).any():
+    finite = valid & np.isfinite(heading) & np.isfinite(velocity).all(-1)
+    if not (np.abs(heading[finite]) > _RADIANS_LIMIT).any():
         return heading
-    moving = valid & (np.hypot(velocity[..., 0], velocity[..., 1]) > _MOVING_SPEED)
+    moving = finite & (np.hypot(velocity[..., 0], velocity[..., 1]) > _MOVING_SPEED)
     travel = np.arctan2(velocity[moving][:, 1], velocity[moving][:, 0])
     if np.cos(heading[moving] - travel).sum() > np.cos(np.deg2rad(heading[moving]) - travel).sum():
         return heading
-    return np.remainder(np.deg2rad(heading) + math.pi, 2 * math.pi) - math.pi
+    radians = np.full_like(heading, np.nan)
+    np.remainder(np.deg2rad(heading) + math.pi, 2 * math.pi, out=radians, where=np.isfinite(heading))
+    return radians - math.pi
 
 
-def _polyline(road: dict[str, Any], index: int) -> Polyline:
-    kind = road["map_element_id"] if "map_element_id" in road else KIND_OF_FEATURE[road["type"]]
-    return Polyline(road.get("id", index), kind, [(p["x"], p["y"], p["z"]) for p in road["geometry"]])
+def _agent_kind(field: Field, notes: Notes) -> AgentKind:
+    name = field.text()
+    if name.upper() not in AgentKind.__members__:
+        notes[f"object of unknown type {name[:40]!r}, taken as OTHER"] += 1
+    return AgentKind.__members__.get(name.upper(), AgentKind.OTHER)
 
 
-def _lights(table: dict[str, dict[str, list]], name: str) -> list[LightListing]:
-    return [
-        LightListing(step, int(lane), _named(LightState, state, f"light of lane {lane}", name), (x, y, z))
-        for lane, light in table.items()
-        for step, state, x, y, z in zip(
-            *(light[field] for field in ("time_index", "state", "x", "y", "z")), strict=True
-        )
-    ]
+def _polyline(road: Field, index: int, notes: Notes) -> Polyline:
+    return Polyline(_id(road, index), _map_kind(road, notes), road["geometry"].table("x", "y", "z"))
 
 
-def _named(enum: type, value: str, what: str, name: str) -> int:
-    if value.upper() not in enum.__members__:
-        raise SceneError(f"{name}: the {what} is {value!r}; known: {[member.lower() for member in enum.__members__]}.")
-    return int(enum[value.upper()])
+def _map_kind(road: Field, notes: Notes) -> MapKind:
+    """The exact kind where the file has it, or what its type alone says."""
+    name = road["type"].text()
+    if name not in KIND_OF_FEATURE:
+        raise road["type"].error(f"be one of {', '.join(KIND_OF_FEATURE)}")
+    number = road.get("map_element_id")
+    if number is None:
+        return KIND_OF_FEATURE[name]
+    if number.integer(lowest=-(2**62)) not in set(MapKind):
+        notes[f"{name} of unknown map_element_id {number.value}, taken as {KIND_OF_FEATURE[name].name}"] += 1
+        return KIND_OF_FEATURE[name]
+    return MapKind(number.value)
 
 
-@contextmanager
-def _open(path: str) -> Iterator[Callable[[Unit], Scene]]:
-    def make(unit: Unit) -> Scene:
-        opener = _OPENERS.get(Path(path).suffix, open)
-        try:
-            with opener(path, "rt", encoding="utf-8") as file:
-                data = json.load(file)
-            return scene_from_json(data, unit.name)
-        except SceneError:
-            raise
-        except KeyError as error:
-            raise SceneError(f"{unit.name}: the entry {error} is missing; it is not a GPUDrive scene.") from error
-        except (AttributeError, EOFError, OSError, TypeError, ValueError, lzma.LZMAError, zlib.error) as error:
-            raise SceneError(f"{unit.name}: not a GPUDrive scene ({error}); fetch the file again.") from error
+def _listings(light: Field, notes: Notes) -> Iterator[LightListing]:
+    """All that a file says of the light of one lane, whose id is the key of the entry."""
+    lane = light.key_as_integer()
+    columns = {key: light[key].items() for key in ("time_index", "state", "x", "y", "z")}
+    if len({len(column) for column in columns.values()}) > 1:
+        counts = ", ".join(f"{len(column)} of {key}" for key, column in columns.items())
+        raise SceneError(f"{light.name}: {light.path} has {counts}; must have as many of each.")
+    for step, state, x, y, z in zip(*columns.values(), strict=True):
+        point = (x.number(), y.number(), z.number())
+        yield LightListing(step.integer(highest=LOG_STEPS - 1), lane, _light_state(state, notes), point)
 
-    yield make
+
+def _light_state(field: Field, notes: Notes) -> LightState:
+    name = field.text()
+    if name.upper() not in LightState.__members__:
+        notes[f"light of unknown state {name[:40]!r}, taken as UNKNOWN"] += 1
+    return LightState.__members__.get(name.upper(), LightState.UNKNOWN)
+
+
+def _records(path: str) -> Iterator[Record]:
+    yield Record(path, 0, partial(_make, path))
+
+
+def _make(path: str, notes: Notes) -> Scene:
+    name = f"{path}, record 0"
+    packed = read_file(path, MAX_BYTES)
+    opener = _OPENERS.get(Path(path).suffix)
+    try:
+        text = packed
+        if opener is not None:
+            with opener(io.BytesIO(packed)) as content:
+                text = content.read(MAX_BYTES + 1)
+    except (EOFError, OSError, lzma.LZMAError, zlib.error) as error:
+        raise SceneError(f"{name}: cannot be unpacked ({error}); fetch the file again.") from error
+    if len(text) > MAX_BYTES:
+        raise SceneError(f"{name}: has more than {MAX_BYTES >> 20} MiB when unpacked; that is no scene.")
+    return scene_from_json(decode_json(text, name), notes)
 
 
 GPUDRIVE = Source(
     name="gpudrive",
     help="GPUDrive JSON of WOMD scenes, one in a file: .json, .json.gz or .json.xz",
     find=lambda paths: find_files(paths, "*.json", "*.json.gz", "*.json.xz"),
-    locate=lambda path: iter([Unit(path)]),
-    open=_open,
+    records=_records,
+    count=lambda path: 1,
+    lacks=_LACKS,
 )

@@ -17,6 +17,7 @@ from envs.scene import (
     LOG_STEPS,
     AgentKind,
     Agents,
+    Lacks,
     Lights,
     LightState,
     MapKind,
@@ -24,6 +25,7 @@ from envs.scene import (
     Scene,
     SceneError,
 )
+from envs.sources.source import Notes
 
 KIND_OF_FEATURE = {
     "lane": MapKind.LANE_UNDEFINED,
@@ -35,6 +37,51 @@ KIND_OF_FEATURE = {
     "driveway": MapKind.DRIVEWAY,
 }
 """WOMD's map features by name; the types of lanes, lines and edges count from these kinds on."""
+_MAP_KINDS, _AGENT_KINDS = frozenset(MapKind), frozenset(AgentKind)
+_LIGHT_STATES = frozenset(LightState) - {LightState.ABSENT}
+_LAST_KIND = {
+    "lane": MapKind.LANE_BIKE,
+    "road_line": MapKind.LINE_PASSING_YELLOW,
+    "road_edge": MapKind.EDGE_MEDIAN,
+}
+
+
+def map_kind(feature: str, number: int, notes: Notes) -> MapKind:
+    """Kind of a lane, line or edge from WOMD's number of its type.
+
+    Args:
+        feature: ``"lane"``, ``"road_line"`` or ``"road_edge"``.
+        number: of the type, counted from 0.
+        notes: counts a number that is not known; the feature is then of the unknown type.
+
+    Examples:
+        >>> from collections import Counter
+        >>> map_kind("lane", 2, notes := Counter()).name, map_kind("lane", 9, notes).name
+        ('LANE_SURFACE_STREET', 'LANE_UNDEFINED')
+        >>> notes
+        Counter({'lane of unknown type 9, taken as LANE_UNDEFINED': 1})
+    """
+    first, last = KIND_OF_FEATURE[feature], _LAST_KIND[feature]
+    if 0 <= number <= last - first and first + number in _MAP_KINDS:
+        return MapKind(first + number)
+    notes[f"{feature} of unknown type {number}, taken as {first.name}"] += 1
+    return first
+
+
+def agent_kind(number: int, notes: Notes) -> AgentKind:
+    """Class of a road user from WOMD's number; an unknown one is noted and taken as OTHER."""
+    if number in _AGENT_KINDS:
+        return AgentKind(number)
+    notes[f"track of unknown object type {number}, taken as OTHER"] += 1
+    return AgentKind.OTHER
+
+
+def light_state(number: int, notes: Notes) -> LightState:
+    """State of a light from WOMD's number; an unknown one is noted and taken as UNKNOWN."""
+    if number in _LIGHT_STATES:
+        return LightState(number)
+    notes[f"light of unknown state {number}, taken as UNKNOWN"] += 1
+    return LightState.UNKNOWN
 
 
 @dataclass(frozen=True)
@@ -89,6 +136,7 @@ class Recording:
         polylines: the map.
         links: rows ``(feature_id, feature_id, LinkKind)``, in any order, repeated or not.
         lights: listings in recorded order; of several for one lane and step the later one counts (SPEC section 4.2).
+        lacks: what the recording does not have.
     """
 
     scene_id: str
@@ -104,6 +152,7 @@ class Recording:
     polylines: Sequence[Polyline]
     links: Sequence[tuple[int, int, int]] = ()
     lights: Sequence[LightListing] = field(default=())
+    lacks: Lacks = Lacks.NOTHING
 
     def to_scene(self, name: str) -> Scene:
         """Move the recording to its own origin and round it to float32.
@@ -115,8 +164,8 @@ class Recording:
             name: what errors call the recording (a file and record).
 
         Raises:
-            SceneError: an index, kind or state out of its range, a repeated track id, an origin or light that is not
-                finite. :meth:`~envs.scene.Scene.validate` checks the rest.
+            SceneError: an index out of its range, a repeated track id, a number that does not fit, an origin or light
+                that is not finite. :meth:`~envs.scene.Scene.validate` checks the rest.
         """
         self._check(name)
         origin = self._origin(name)
@@ -125,6 +174,7 @@ class Recording:
             road=self._road(origin),
             lights=self._lights(origin, name),
             origin=torch.from_numpy(origin),
+            lacks=torch.tensor(int(self.lacks)),
             scene_id=self.scene_id,
             batch_size=[],
         )
@@ -136,11 +186,16 @@ class Recording:
                 raise SceneError(f"{name}: the {role} is track {index} of {num}; give the index of a track.")
         if len(set(self.track_id)) != num:
             raise SceneError(f"{name}: two tracks share an id; give every track its own.")
-        _check_enum(name, "track", AgentKind, self.kind, self.track_id)
-        _check_enum(
-            name, "map feature", MapKind, [p.kind for p in self.polylines], [p.feature_id for p in self.polylines]
-        )
-        _check_enum(name, "light of lane", LightState, [r.state for r in self.lights], [r.lane_id for r in self.lights])
+        ids = {
+            "track": self.track_id,
+            "map feature": [line.feature_id for line in self.polylines],
+            "light of lane": [listing.lane_id for listing in self.lights],
+            "link of lane": [lane for link in self.links for lane in link[:2]],
+        }
+        for what, numbers in ids.items():
+            for number in numbers:
+                if not -(2**63) <= number < 2**63:
+                    raise SceneError(f"{name}: {what} {number} has an id of more than 64 bits; give a smaller one.")
 
     def _origin(self, name: str) -> np.ndarray:
         if not self.valid[self.sdc, CURRENT_STEP]:
@@ -156,14 +211,14 @@ class Recording:
 
         def masked(values: np.ndarray) -> Tensor:
             mask = valid.reshape(valid.shape + (1,) * (values.ndim - 2))
-            return torch.from_numpy(np.where(mask, values, 0.0).astype(np.float32))
+            return _float32(np.where(mask, values, 0.0))
 
         return Agents(
             position=masked(self.position - origin),
             heading=masked(self.heading),
             velocity=masked(self.velocity),
             valid=torch.from_numpy(valid.copy()),
-            extent=torch.from_numpy(self.extent[np.arange(num), size_step].astype(np.float32)),
+            extent=_float32(self.extent[np.arange(num), size_step]),
             kind=torch.tensor(self.kind, dtype=torch.int64),
             track_id=torch.tensor(self.track_id, dtype=torch.int64),
             predict=_marked(self.predict, num),
@@ -179,7 +234,7 @@ class Recording:
         known = {line.feature_id for line in lines}
         links = sorted({link for link in self.links if link[0] in known and link[1] in known})
         return RoadMap(
-            points=torch.from_numpy((points - origin).astype(np.float32)),
+            points=_float32(points - origin),
             start=torch.cumsum(count, 0) - count,
             count=count,
             kind=torch.tensor([line.kind for line in lines], dtype=torch.int64),
@@ -193,7 +248,7 @@ class Recording:
         lanes = sorted({row.lane_id for row in self.lights})
         index = {lane: g for g, lane in enumerate(lanes)}
         state = np.full((len(lanes), LOG_STEPS), LightState.ABSENT, dtype=np.int64)
-        stop = np.zeros((len(lanes), LOG_STEPS, 3), dtype=np.float32)
+        stop = np.zeros((len(lanes), LOG_STEPS, 3))
         for row in self.lights:
             point = np.asarray(row.stop_point) - origin
             if not np.isfinite(point).all():
@@ -206,18 +261,15 @@ class Recording:
         return Lights(
             lane_id=torch.tensor(lanes, dtype=torch.int64),
             state=torch.from_numpy(state),
-            stop_point=torch.from_numpy(stop),
+            stop_point=_float32(stop),
             batch_size=[],
         )
 
 
-def _check_enum(name: str, what: str, enum: type, values: Sequence[int], ids: Sequence[int]) -> None:
-    known = {int(member) for member in enum}
-    for value, number in zip(values, ids, strict=True):
-        if value not in known:
-            raise SceneError(
-                f"{name}: {what} {number} has the unknown {enum.__name__} {value}; known: {sorted(known)}."
-            )
+def _float32(values: np.ndarray) -> Tensor:
+    """Rounded; what is too large becomes infinite, which the scene's validation then names."""
+    with np.errstate(over="ignore"):
+        return torch.from_numpy(values.astype(np.float32))
 
 
 def _marked(indices: Sequence[int], num: int) -> Tensor:

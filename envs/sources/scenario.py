@@ -1,10 +1,16 @@
 """Message classes for the Scenario proto of the Waymo Open Motion Dataset.
 
-Field numbers are facts of the format (SPEC section 9). Fields that nothing here reads (camera, lidar) are left out: a
-parser skips what it does not know.
+Field numbers are facts of the format (SPEC section 9). Fields that no scene keeps (lidar, camera, boundary segments of
+lanes) are listed too, so that a field which is really unknown can be told from them.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from google.protobuf.message import Message
+from google.protobuf.unknown_fields import UnknownFieldSet
 
 from envs.sources.protobuf import message_classes
 
@@ -16,6 +22,7 @@ _CLASSES = message_classes(
     {
         "Scenario": {
             "timestamps_seconds": (1, "double*"),
+            "field_3": (3, "bytes"),  # empty in some of Waymo's files, and not in the published description
             "tracks": (2, "Track*"),
             "objects_of_interest": (4, "int32*"),
             "scenario_id": (5, "string"),
@@ -24,6 +31,8 @@ _CLASSES = message_classes(
             "map_features": (8, "MapFeature*"),
             "current_time_index": (10, "int32"),
             "tracks_to_predict": (11, "RequiredPrediction*"),
+            "compressed_frame_laser_data": (12, "bytes*"),
+            "frame_camera_tokens": (13, "bytes*"),
         },
         "Track": {"id": (1, "int32"), "object_type": (2, "int32"), "states": (3, "ObjectState*")},
         "ObjectState": {
@@ -61,8 +70,17 @@ _CLASSES = message_classes(
             "exit_lanes": (10, "int64[]"),
             "left_neighbors": (11, "LaneNeighbor*"),
             "right_neighbors": (12, "LaneNeighbor*"),
+            "left_boundaries": (13, "bytes*"),
+            "right_boundaries": (14, "bytes*"),
         },
-        "LaneNeighbor": {"feature_id": (1, "int64")},
+        "LaneNeighbor": {
+            "feature_id": (1, "int64"),
+            "self_start_index": (2, "int32"),
+            "self_end_index": (3, "int32"),
+            "neighbor_start_index": (4, "int32"),
+            "neighbor_end_index": (5, "int32"),
+            "boundaries": (6, "bytes*"),
+        },
         "RoadLine": _LINE,
         "RoadEdge": _LINE,
         "StopSign": {"lane": (1, "int64*"), "position": (2, "MapPoint")},
@@ -74,3 +92,28 @@ _CLASSES = message_classes(
 
 Scenario = _CLASSES["Scenario"]
 """The message class: ``Scenario.FromString(data)``."""
+
+
+def unknown_fields(payload: bytes) -> Iterator[str]:
+    """Fields of a serialized Scenario that the format above does not have, as ``Message.number``, one for each time.
+
+    Examples:
+        >>> list(unknown_fields(Scenario(scenario_id="a").SerializeToString()))
+        []
+        >>> field_99 = bytes([0x98, 0x06, 0x01])
+        >>> list(unknown_fields(Scenario(scenario_id="a").SerializeToString() + field_99))
+        ['Scenario.99']
+    """
+    scenario = Scenario.FromString(payload)
+    size = scenario.ByteSize()
+    scenario.DiscardUnknownFields()
+    if scenario.ByteSize() != size:  # walking through a hundred thousand points is slow, and hardly ever needed
+        yield from _walk(Scenario.FromString(payload))
+
+
+def _walk(message: Any) -> Iterator[str]:
+    yield from (f"{message.DESCRIPTOR.name}.{field.field_number}" for field in UnknownFieldSet(message))
+    for field, value in message.ListFields():
+        if field.message_type is not None:
+            for inner in [value] if isinstance(value, Message) else value:
+                yield from _walk(inner)

@@ -11,8 +11,7 @@ scenes. The splits draw from ranges of unit numbers that never meet: no two shar
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from importlib.resources import files
@@ -20,8 +19,8 @@ from pathlib import Path
 
 import yaml
 
-from envs.scene import LOG_STEPS, STEP_SECONDS, Scene, SceneError
-from envs.sources.source import Source, Unit
+from envs.scene import LOG_STEPS, STEP_SECONDS, Lacks, Scene, SceneError
+from envs.sources.source import Record, Source
 from envs.sources.sumo_map import build_map
 from envs.sources.sumo_network import make_network, sumo_binary
 from envs.sources.sumo_scene import Crop, cut_scene, sdc_candidates
@@ -269,24 +268,21 @@ def _read_unit(text: str) -> SumoUnit:
     return SumoUnit(preset, number, num_scenes, make_options(**told))
 
 
-@contextmanager
-def _open(text: str) -> Iterator[Callable[[Unit], Scene]]:
-    """A simulation that runs once, when its first scene is asked for."""
-    scenes: list[Scene] = []
-
-    def make(unit: Unit) -> Scene:
-        if not scenes:
-            scenes.extend(simulate(_read_unit(text)))
-        return scenes[unit.key]
-
-    yield make
+def _records(text: str) -> Iterator[Record]:
+    """The scenes of one simulation, which runs once, when the first of them is made."""
+    unit = _read_unit(text)
+    scenes = cache(lambda: simulate(unit))
+    for index in range(unit.num_scenes):
+        yield Record(text, index, lambda notes, index=index: scenes()[index])
 
 
 SUMO = Source(
     name="sumo",
     help="scenes simulated with SUMO; instead of files: num_scenes=160,seed=0,split=train,preset=mixed",
     find=_find,
-    locate=lambda text: (Unit(text, i, i) for i in range(_read_unit(text).num_scenes)),
-    open=_open,
+    records=_records,
+    count=lambda text: _read_unit(text).num_scenes,
+    size=lambda text: 0,
+    lacks=Lacks.HEIGHT,
 )
 """One input is one simulation; a shard size that is a multiple of ``scenes_per_unit`` runs each only once."""

@@ -16,6 +16,7 @@ from envs.scene import (
     LOG_STEPS,
     AgentKind,
     Agents,
+    Lacks,
     Lights,
     LightState,
     MapKind,
@@ -114,6 +115,7 @@ def cut_scene(
         road=road_map,
         lights=_cut_lights(road, lights, kept, window, origin),
         origin=torch.tensor([*origin, 0.0], dtype=torch.float64),
+        lacks=torch.tensor(Lacks.HEIGHT),
         scene_id=scene_id,
         batch_size=[],
     ).validate()

@@ -11,6 +11,7 @@ from envs.scene import (
     STEP_SECONDS,
     AgentKind,
     Agents,
+    Lacks,
     Lights,
     LightState,
     MapKind,
@@ -84,6 +85,7 @@ def build_scene(
         ),
         lights=no_lights() if lights is None else lights,
         origin=torch.zeros(3, dtype=torch.float64),
+        lacks=torch.tensor(Lacks.TOPOLOGY | Lacks.SPEED_LIMITS),
         scene_id=scene_id,
         batch_size=[],
     )

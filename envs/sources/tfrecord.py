@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import gzip
+import os
 import struct
 import zlib
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from typing import BinaryIO
 
 import google_crc32c
@@ -17,6 +19,8 @@ _HEADER = struct.Struct("<QI")
 _FOOTER = struct.Struct("<I")
 _CRC_MASK = 0xA282EAD8
 _GZIP_MAGIC = b"\x1f\x8b\x08"
+MAX_PAYLOAD = 1 << 28
+"""No record is larger [bytes]; a scene of WOMD has about a million."""
 
 
 def masked_crc(data: bytes) -> int:
@@ -43,61 +47,91 @@ def frame(payload: bytes) -> bytes:
     return length + _FOOTER.pack(masked_crc(length)) + payload + _FOOTER.pack(masked_crc(payload))
 
 
-def open_binary(path: str) -> BinaryIO:
-    """Open a file for reading; gzip is recognised by its first bytes and unpacked on the way."""
-    with Path(path).open("rb") as file:
-        head = file.read(_HEADER.size)
-    packed = head.startswith(_GZIP_MAGIC) and _length(head) is None
-    return gzip.open(path, "rb") if packed else Path(path).open("rb")
-
-
-def offsets(path: str) -> Iterator[int]:
-    """Byte offset of every frame (in the unpacked file), from the headers alone: payloads are skipped, not checked.
-
-    Raises:
-        SceneError: naming the file and the first record whose frame is broken; frames before it have been given.
-    """
-    with open_binary(path) as file:
-        # Seeking beyond the end is no error, so a cut last payload shows only against the size of the file.
-        size = _size(file, path)
-        if size == 0:
-            raise SceneError(f"{path}: the file is empty; fetch it again.")
-        position, record = 0, 0
-        while position < size:
-            file.seek(position)
-            head = file.read(_HEADER.size)
-            length = _length(head)
-            if len(head) < _HEADER.size or (length is not None and position + _frame_size(length) > size):
-                raise SceneError(f"{path}, record {record}: the file ends within the record; fetch the file again.")
-            if length is None:
-                raise SceneError(
-                    f"{path}, record {record}: the checksum of the record's length is wrong at byte {position}; "
-                    "this is no TFRecord file, or it is damaged: fetch it again."
-                )
-            yield position
-            position, record = position + _frame_size(length), record + 1
-
-
-def read_frame(file: BinaryIO, offset: int, name: str) -> bytes:
-    """The payload of the frame at an offset, checked.
+def read_frames(file: BinaryIO, name: str) -> Iterator[Callable[[], bytes]]:
+    """Go through the frames of an open file once; payloads that nobody reads are skipped.
 
     Args:
-        file: from :func:`open_binary`.
-        offset: from :func:`offsets`.
-        name: what errors call the record.
+        file: of :func:`unpacked`.
+        name: what errors call the file.
+
+    Yields:
+        For each frame a function that reads and checks its payload; it works until the next frame is asked for.
 
     Raises:
-        SceneError: the payload is cut or does not fit its checksum.
+        SceneError: naming the file and the first record whose frame is broken; the rest of the file is lost.
     """
-    file.seek(offset)
-    length = _length(file.read(_HEADER.size))
-    body = b"" if length is None else file.read(length + _FOOTER.size)
-    if length is None or len(body) != length + _FOOTER.size:
+    position = record = 0
+    while head := _read(file, _HEADER.size, f"{name}, record {record}"):
+        length = _length(head)
+        if len(head) < _HEADER.size:
+            raise SceneError(f"{name}, record {record}: the file ends within the record; fetch the file again.")
+        if length is None:
+            raise SceneError(
+                f"{name}, record {record}: the checksum of the record's length is wrong at byte {position}; "
+                "this is no TFRecord file, or it is damaged: fetch it again."
+            )
+        if length > MAX_PAYLOAD:
+            raise SceneError(f"{name}, record {record}: claims {length} bytes; at most {MAX_PAYLOAD} are read.")
+        yield partial(_read_payload, file, length, f"{name}, record {record}")
+        position, record = position + _frame_size(length), record + 1
+        _seek(file, position, f"{name}, record {record}")
+    if record == 0:
+        raise SceneError(f"{name}: the file is empty; fetch it again.")
+
+
+def count_frames(file: BinaryIO) -> int:
+    """Frames of a file that is not packed, from the headers alone; a broken one counts and is the last."""
+    size = file.seek(0, os.SEEK_END)
+    position = count = 0
+    while position < size:
+        file.seek(position)
+        length = _length(file.read(_HEADER.size))
+        count += 1
+        if length is None:
+            break
+        position += _frame_size(length)
+    return max(count, 1)
+
+
+@contextmanager
+def unpacked(file: BinaryIO) -> Iterator[BinaryIO]:
+    """The content of a file that may be packed by gzip, which is recognised by its first bytes."""
+    if is_packed(file):
+        with gzip.open(file, "rb") as content:
+            yield content
+    else:
+        yield file
+
+
+def is_packed(file: BinaryIO) -> bool:
+    """Whether gzip has packed a file, which is left at its beginning."""
+    head = file.read(_HEADER.size)
+    file.seek(0)
+    return head.startswith(_GZIP_MAGIC) and _length(head) is None
+
+
+def _read_payload(file: BinaryIO, length: int, name: str) -> bytes:
+    body = _read(file, length + _FOOTER.size, name)
+    if len(body) != length + _FOOTER.size:
         raise SceneError(f"{name}: the file ends within the record; fetch the file again.")
     payload = body[:length]
     if _FOOTER.unpack(body[length:])[0] != masked_crc(payload):
         raise SceneError(f"{name}: the checksum of the record is wrong; the file is damaged: fetch it again.")
     return payload
+
+
+def _read(file: BinaryIO, size: int, name: str) -> bytes:
+    try:
+        return file.read(size)
+    except (EOFError, OSError, zlib.error) as error:
+        raise SceneError(f"{name}: cannot be unpacked or read ({error}); fetch the file again.") from error
+
+
+def _seek(file: BinaryIO, position: int, name: str) -> None:
+    try:
+        file.seek(position)
+    except (EOFError, OSError, ValueError, zlib.error) as error:
+        raise SceneError(f"{name}: cannot be unpacked or read ({error}); fetch the file again.") from error
 
 
 def _length(head: bytes) -> int | None:
@@ -110,15 +144,3 @@ def _length(head: bytes) -> int | None:
 
 def _frame_size(length: int) -> int:
     return _HEADER.size + length + _FOOTER.size
-
-
-def _size(file: BinaryIO, path: str) -> int:
-    try:
-        if not isinstance(file, gzip.GzipFile):
-            return file.seek(0, 2)
-        size = 0
-        while chunk := file.read(1 << 20):
-            size += len(chunk)
-        return size
-    except (EOFError, OSError, zlib.error) as error:
-        raise SceneError(f"{path}: cannot be unpacked ({error}); fetch the file again.") from error

@@ -5,8 +5,9 @@ A file is a TFRecord (plain or gzip), or one serialized Scenario where its name 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,16 +16,15 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from envs.scene import CURRENT_STEP, LOG_STEPS, LinkKind, MapKind, Scene, SceneError
-from envs.sources.recording import LightListing, Polyline, Recording
-from envs.sources.scenario import Scenario
-from envs.sources.source import Source, Unit, find_files
-from envs.sources.tfrecord import offsets, open_binary, read_frame
+from envs.sources.files import find_files, is_remote, open_file
+from envs.sources.recording import LightListing, Polyline, Recording, agent_kind, light_state, map_kind
+from envs.sources.scenario import Scenario, unknown_fields
+from envs.sources.source import Notes, Record, Source
+from envs.sources.tfrecord import MAX_PAYLOAD, count_frames, is_packed, read_frames, unpacked
 
 METRES_PER_SECOND_PER_MPH = 0.44704
 _BARE_SUFFIXES = (".binproto", ".pb")
 _INVALID_STATE = (0.0,) * 9
-# Enum of the map feature plus this is its MapKind; the enums of WOMD each count from 0.
-_LINE_OFFSET, _EDGE_OFFSET = int(MapKind.LINE_UNKNOWN), int(MapKind.EDGE_UNKNOWN)
 _POLYGONS = {"crosswalk": MapKind.CROSSWALK, "speed_bump": MapKind.SPEED_BUMP, "driveway": MapKind.DRIVEWAY}
 
 
@@ -52,13 +52,15 @@ def read_womd(path: str | Path) -> Iterator[Scene]:
     return WOMD.scenes(str(path))
 
 
-def scene_from_scenario(scenario: Any, name: str) -> Scene:
+def scene_from_scenario(scenario: Any, name: str, notes: Notes | None = None) -> Scene:
     """One parsed Scenario -> scene.
 
     Args:
         scenario: a message of :data:`~envs.sources.scenario.Scenario`, or of the official class.
         name: what errors call it.
+        notes: counts types and states that are not known.
     """
+    notes = Counter() if notes is None else notes
     name = f"{name} (scene {scenario.scenario_id})"
     _check_steps(scenario, name)
     states = np.array([[_state(state) for state in track.states] for track in scenario.tracks], dtype=np.float64)
@@ -70,13 +72,13 @@ def scene_from_scenario(scenario: Any, name: str) -> Scene:
         heading=states[..., 6],
         velocity=states[..., 7:9],
         valid=np.array([[state.valid for state in track.states] for track in scenario.tracks]),
-        kind=[track.object_type for track in scenario.tracks],
+        kind=[agent_kind(track.object_type, notes) for track in scenario.tracks],
         track_id=[track.id for track in scenario.tracks],
         sdc=scenario.sdc_track_index if scenario.HasField("sdc_track_index") else -1,
         predict=[required.track_index for required in scenario.tracks_to_predict],
-        polylines=[_polyline(feature, name) for feature in features],
+        polylines=[line for feature in features if (line := _polyline(feature, notes)) is not None],
         links=[link for feature in features if feature.HasField("lane") for link in _links(feature.id, feature.lane)],
-        lights=_lights(scenario),
+        lights=_lights(scenario, notes),
     ).to_scene(name)
 
 
@@ -114,21 +116,23 @@ def _state(state: Any) -> tuple[float, ...]:
     )
 
 
-def _polyline(feature: Any, name: str) -> Polyline:
+def _polyline(feature: Any, notes: Notes) -> Polyline | None:
     make = partial(Polyline, feature.id)
     if feature.HasField("lane"):
         lane = feature.lane
-        return make(lane.type, _xyz(lane.polyline), lane.speed_limit_mph * METRES_PER_SECOND_PER_MPH)
-    if feature.HasField("road_line"):
-        return make(feature.road_line.type + _LINE_OFFSET, _xyz(feature.road_line.polyline))
-    if feature.HasField("road_edge"):
-        return make(feature.road_edge.type + _EDGE_OFFSET, _xyz(feature.road_edge.polyline))
+        kind = map_kind("lane", lane.type, notes)
+        return make(kind, _xyz(lane.polyline), lane.speed_limit_mph * METRES_PER_SECOND_PER_MPH)
+    for field in ("road_line", "road_edge"):
+        if feature.HasField(field):
+            line = getattr(feature, field)
+            return make(map_kind(field, line.type, notes), _xyz(line.polyline))
     if feature.HasField("stop_sign"):
         return make(MapKind.STOP_SIGN, _xyz([feature.stop_sign.position]))
     for field, kind in _POLYGONS.items():
         if feature.HasField(field):
             return make(kind, _xyz(getattr(feature, field).polygon))
-    raise SceneError(f"{name}: map feature {feature.id} is of a kind that is not known here; remove it.")
+    notes["map feature of an unknown kind, left out"] += 1
+    return None
 
 
 def _xyz(points: Any) -> list[tuple[float, float, float]]:
@@ -142,45 +146,70 @@ def _links(lane_id: int, lane: Any) -> Iterator[tuple[int, int, int]]:
     yield from ((lane_id, beside.feature_id, LinkKind.RIGHT) for beside in lane.right_neighbors)
 
 
-def _lights(scenario: Any) -> list[LightListing]:
+def _lights(scenario: Any, notes: Notes) -> list[LightListing]:
     # An unset stop point is (0, 0, 0) of the world: proto2's default, and what the official metric reads.
     return [
-        LightListing(step, row.lane, row.state, (row.stop_point.x, row.stop_point.y, row.stop_point.z))
+        LightListing(
+            step,
+            row.lane,
+            light_state(row.state, notes),
+            (row.stop_point.x, row.stop_point.y, row.stop_point.z),
+        )
         for step, listed in enumerate(scenario.dynamic_map_states)
         for row in listed.lane_states
     ]
+
+
+def payloads(path: str) -> Iterator[Callable[[], bytes]]:
+    """The serialized Scenarios of a file in one pass, each read when its function is called.
+
+    Args:
+        path: local or an address.
+
+    Raises:
+        SceneError: the file, or the rest of it, cannot be read.
+    """
+    with open_file(path) as file, unpacked(file) as content:
+        if _is_bare(path):
+            yield partial(content.read, MAX_PAYLOAD)
+        else:
+            yield from read_frames(content, path)
 
 
 def _is_bare(path: str) -> bool:
     return path.removesuffix(".gz").endswith(_BARE_SUFFIXES)
 
 
-def _locate(path: str) -> Iterator[Unit]:
-    where = iter([0]) if _is_bare(path) else offsets(path)
-    return (Unit(path, record, offset) for record, offset in enumerate(where))
+def _count(path: str) -> int | None:
+    """Scenes of a file, if that is cheap to tell."""
+    if _is_bare(path):
+        return 1
+    if is_remote(path):
+        return None
+    with open_file(path) as file:
+        return None if is_packed(file) else count_frames(file)
 
 
-@contextmanager
-def _open(path: str) -> Iterator[Callable[[Unit], Scene]]:
-    with open_binary(path) as file:
+def _records(path: str) -> Iterator[Record]:
+    with closing(payloads(path)) as contents:
+        for index, read in enumerate(contents):
+            yield Record(path, index, partial(_make, read, f"{path}, record {index}"))
 
-        def make(unit: Unit) -> Scene:
-            payload = file.read() if _is_bare(path) else read_frame(file, unit.key, unit.name)
-            try:
-                scenario = Scenario.FromString(payload)
-            except DecodeError as error:
-                raise SceneError(
-                    f"{unit.name}: not a Scenario proto ({error}); convert WOMD's scenario files."
-                ) from error
-            return scene_from_scenario(scenario, unit.name)
 
-        yield make
+def _make(read: Callable[[], bytes], name: str, notes: Notes) -> Scene:
+    payload = read()
+    try:
+        scenario = Scenario.FromString(payload)
+    except DecodeError as error:
+        raise SceneError(f"{name}: not a Scenario proto ({error}); convert WOMD's scenario files.") from error
+    notes.update(f"unknown field {field}, left out" for field in unknown_fields(payload))
+    return scene_from_scenario(scenario, name, notes)
 
 
 WOMD = Source(
     name="womd",
     help="Waymo Open Motion Dataset: TFRecord files of Scenario protos",
     find=lambda paths: find_files(paths, "*.tfrecord*", *(f"*{suffix}" for suffix in _BARE_SUFFIXES)),
-    locate=_locate,
-    open=_open,
+    records=_records,
+    count=_count,
 )

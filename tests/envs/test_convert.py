@@ -5,20 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
-from envs.convert import convert, main
+from envs.convert import convert
+from envs.convert.__main__ import main
 from envs.scene import SceneError
-from envs.sources import SOURCES, Source, Unit
+from envs.sources import SOURCES, Record, Source
 from envs.sources.scenario import Scenario
 from envs.sources.synthetic import straight_road
 from envs.sources.tfrecord import frame
@@ -47,7 +46,7 @@ def raw(make_scenario, tmp_path: Path) -> Path:
 def test_every_scene_of_every_file_in_order(raw: Path, tmp_path: Path) -> None:
     store = convert("womd", [raw], tmp_path / "out", shard_size=2)
     assert store.scene_ids == [f"scene{number}" for number in range(7)]
-    assert [entry["scenes"] for entry in store.manifest.shards] == [2, 2, 2, 1]
+    assert [entry["scenes"] for entry in store.manifests[0].shards] == [2, 2, 2, 1]
     assert store.provenance(4) == (str(raw / "b.tfrecord-00000-of-00001"), 1)
     assert store.num_agents.tolist() == [1, 2, 3, 1, 2, 3, 1]
     direct = list(read_womd(raw / "a.tfrecord"))
@@ -96,8 +95,8 @@ def test_a_lost_shard_is_made_again_and_leftovers_go(raw: Path, tmp_path: Path) 
     out = tmp_path / "out"
     convert("womd", [raw], out, shard_size=2)
     whole = digests(out)
-    shutil.rmtree(out / "00001")
-    (out / ".partial-00001-77").mkdir()
+    (out / "00001.scenes").unlink()
+    (out / ".partial-00001.scenes-77").write_bytes(b"half")
     manifest = json.loads((out / "manifest.json").read_text())
     (out / "manifest.json").write_text(json.dumps({**manifest, "complete": False, "shards": []}))
     convert("womd", [raw], out, shard_size=2)
@@ -117,8 +116,11 @@ def test_a_source_may_generate_its_scenes(monkeypatch: pytest.MonkeyPatch, tmp_p
         name="roads",
         help="straight roads",
         find=list,
-        locate=lambda cars: (Unit(cars, record, seed) for record, seed in enumerate(range(5, 8))),
-        open=lambda cars: nullcontext(lambda unit: straight_road(int(cars), seed=unit.key)),
+        records=lambda cars: (
+            Record(cars, i, lambda notes, i=i: straight_road(int(cars), seed=5 + i)) for i in range(3)
+        ),
+        count=lambda cars: 3,
+        size=lambda cars: 0,
     )
     monkeypatch.setitem(SOURCES, "roads", roads)
     store = convert("roads", ["2", "4"], tmp_path / "out", shard_size=4)
@@ -140,7 +142,7 @@ def test_a_bad_record_stops_the_conversion_and_finished_shards_stay(raw: Path, t
     out = tmp_path / "out"
     assert main(["womd", str(raw), str(out), "--shard-size", "3"]) == 2
     assert "b.tfrecord-00000-of-00001, record 1: the checksum" in capsys.readouterr().err.splitlines()[-1]
-    assert sorted(path.name for path in out.iterdir()) == ["00000", "manifest.json"]
+    assert sorted(path.name for path in out.iterdir()) == ["00000.scenes", "manifest.json"]
     with pytest.raises(SceneError, match="has not finished"):
         SceneStore(out)
 
@@ -153,7 +155,10 @@ def test_bad_records_can_be_skipped_and_are_listed(raw: Path, tmp_path: Path, ca
     assert main(["womd", str(raw), str(out), "--shard-size", "3", "--skip-bad"]) == 0
     store = SceneStore(out)
     assert store.scene_ids == ["scene0", "scene1", "scene2", "scene3", "scene5", "scene6"]
-    assert [(Path(skip["input"]).name[0], skip["record"]) for skip in store.manifest.skipped] == [("b", 4), ("b", 1)]
+    assert [(Path(skip["input"]).name[0], skip["record"]) for skip in store.manifests[0].skipped] == [
+        ("b", 1),
+        ("b", 4),
+    ]
     assert "skipped   2" in capsys.readouterr().out
     store.verify()
 
@@ -193,7 +198,9 @@ def test_info_and_verify(raw: Path, tmp_path: Path, capsys) -> None:
     assert main(["info", str(out), "--ids"]) == 0
     assert capsys.readouterr().out.splitlines()[-7].split()[:2] == ["0", "scene0"]
     assert main(["verify", str(out)]) == 0
-    (out / "00000/agents/kind.memmap").write_bytes(bytes(13))
+    data = bytearray((out / "00000.scenes").read_bytes())
+    data[30] ^= 1
+    (out / "00000.scenes").write_bytes(data)
     assert main(["verify", str(out)]) == 2
     assert "error: " in capsys.readouterr().err
     assert main(["info", str(tmp_path / "none")]) == 2
@@ -231,7 +238,7 @@ def test_killed_with_two_workers_and_resumed_with_one_gives_the_same_bytes(make_
     command = [sys.executable, "-m", "envs.convert", "womd", raw, cut, "--shard-size", "4", "--workers", "2"]
     process = subprocess.Popen(command, cwd=REPOSITORY, stderr=subprocess.DEVNULL, start_new_session=True)
     try:
-        wait_until((cut / "00001").exists)
+        wait_until((cut / "00001.scenes").exists)
     finally:
         os.kill(process.pid, signal.SIGKILL)
         process.wait()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import hashlib
 import json
@@ -12,28 +13,17 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from envs.scene import Lights, MapKind, Scene, SceneError, SceneSource, collate
-from envs.shards import file_digest, write_shard
+from envs.codec import decode, encode
+from envs.scene import Lacks, Lights, MapKind, Scene, SceneError, SceneSource, collate
+from envs.shards import Shard
 from envs.sources.synthetic import build_scene, red_light, straight_road, two_cars_head_on
-from envs.store import Manifest, SceneStore, write_manifest
-
-
-def store_of(folder: Path, *shards: list[Scene]) -> SceneStore:
-    """A store written by hand, one shard for each list of scenes."""
-    entries = []
-    folder.mkdir(parents=True, exist_ok=True)
-    for number, scenes in enumerate(shards):
-        name = f"{number:05d}"
-        write_shard(folder / name, scenes, [("made", row) for row in range(len(scenes))])
-        digest = file_digest(folder / name / "shard.json")
-        entries.append({"name": name, "scenes": len(scenes), "sha256": digest})
-    write_manifest(folder, Manifest("made", {}, "", complete=True, shards=entries))
-    return SceneStore(folder)
+from envs.store import SceneStore
 
 
 def assert_same(ours: Scene, theirs: Scene) -> None:
     assert ours.scene_id == theirs.scene_id
     assert torch.equal(ours.origin, theirs.origin)
+    assert torch.equal(ours.lacks, theirs.lacks)
     for part in ("agents", "road", "lights"):
         mine, other = getattr(ours, part), getattr(theirs, part)
         for field in mine.__dataclass_fields__:
@@ -49,8 +39,8 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> SceneStore:
-    return store_of(tmp_path / "store", [straight_road(3), red_light()], [two_cars_head_on()])
+def store(tmp_path: Path, write_store) -> SceneStore:
+    return SceneStore(write_store(tmp_path / "store", [straight_road(3), red_light()], [two_cars_head_on()]))
 
 
 def test_a_store_is_a_sequence_of_scenes(store: SceneStore) -> None:
@@ -92,8 +82,8 @@ def scenes(draw: st.DrawFn) -> Scene:
 
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(made=st.lists(scenes(), min_size=1, max_size=4, unique_by=lambda scene: scene.scene_id))
-def test_every_scene_comes_back_exactly(tmp_path_factory: pytest.TempPathFactory, made: list[Scene]) -> None:
-    store = store_of(tmp_path_factory.mktemp("store"), made[:2], *([made[2:]] if made[2:] else []))
+def test_every_scene_comes_back_exactly(tmp_path_factory, write_store, made: list[Scene]) -> None:
+    store = SceneStore(write_store(tmp_path_factory.mktemp("store"), made[:2], made[2:]))
     assert store.scene_ids == [scene.scene_id for scene in made]
     assert store.num_agents.tolist() == [int(scene.agents.present.sum()) for scene in made]
     for index, scene in enumerate(made):
@@ -101,23 +91,14 @@ def test_every_scene_comes_back_exactly(tmp_path_factory: pytest.TempPathFactory
 
 
 def test_changing_a_loaded_scene_changes_neither_the_file_nor_the_next_load(store: SceneStore) -> None:
-    before = digests(store.folder)
+    before = digests(store.folders[0])
     scene = store[1]
     for part in (scene.agents, scene.road, scene.lights):
         for field in part.__dataclass_fields__:
             getattr(part, field).zero_()
     scene.origin.fill_(7)
     assert_same(store[1], red_light())
-    assert digests(store.folder) == before
-
-
-def test_even_the_mapped_arrays_cannot_reach_the_file(store: SceneStore) -> None:
-    before = digests(store.folder)
-    shard = store._shards[0]
-    shard.scene(0)
-    for values in shard._arrays.values():
-        values.zero_()
-    assert digests(store.folder) == before
+    assert digests(store.folders[0]) == before
 
 
 def test_ids_subsets_and_provenance(store: SceneStore) -> None:
@@ -135,82 +116,142 @@ def test_ids_subsets_and_provenance(store: SceneStore) -> None:
         part.index_of("red_light")
 
 
-def test_a_store_travels_as_its_folder_and_opens_again(store: SceneStore) -> None:
+def test_a_store_travels_as_its_folders_and_opens_again(store: SceneStore) -> None:
     part = store.subset([1])
     part[0]
-    _, (folder, rows) = part.__reduce__()
-    assert (folder, rows.tolist()) == (store.folder, [1])
+    _, (folders, rows) = part.__reduce__()
+    assert (folders, rows.tolist()) == (store.folders, [1])
     arrived = copy.copy(part)
     assert arrived.scene_ids == ["red_light"]
     assert_same(arrived[0], red_light())
 
 
-def test_values_at_invalid_steps_are_refused(tmp_path: Path) -> None:
+def test_several_folders_are_one_store_and_can_be_told_apart(tmp_path: Path, write_store) -> None:
+    roads = write_store(tmp_path / "a", [straight_road(2), straight_road(5)], source="womd", split="training")
+    lights = write_store(tmp_path / "b", [red_light()], source="sumo", split="test")
+    store = SceneStore(roads, lights)
+    assert store.scene_ids == ["straight_road_2_None", "straight_road_5_None", "red_light"]
+    assert_same(store[2], red_light())
+    assert store.select(source="sumo").scene_ids == ["red_light"]
+    assert store.select(split="training", min_agents=3).scene_ids == ["straight_road_5_None"]
+    assert copy.copy(store.select(has_lights=False)).scene_ids == store.scene_ids[:2]
+    store.verify()
+    with pytest.raises(ValueError, match="no split 'tune'; there is 'training', 'test'"):
+        store.select(split="tune")
+    with pytest.raises(SceneError, match="share scene red_light"):
+        SceneStore(lights, lights)
+
+
+def test_scenes_are_selected_by_what_they_hold(store: SceneStore) -> None:
+    assert store.select(has_lights=True).scene_ids == ["red_light"]
+    assert store.select(max_agents=2, has_lights=False).scene_ids == [two_cars_head_on().scene_id]
+    assert len(store.select(without=Lacks.TOPOLOGY)) == 0
+    assert len(store.select(without=Lacks.LIGHTS)) == 3
+    assert len(store.select(min_agents=9)) == 0
+
+
+def test_blocks_are_runs_of_scenes_of_one_file(store: SceneStore) -> None:
+    assert store.blocks == [2, 1]
+    assert store.subset([0, 2, 1]).blocks == [1, 1, 1]
+    assert store.subset([1, 0]).blocks == [2]
+    assert store.subset([]).blocks == []
+
+
+def test_values_at_invalid_steps_are_refused() -> None:
     scene = straight_road()
     scene.agents.valid[0, 50] = False
     with pytest.raises(SceneError, match=r"agents\.\w+ is not zero at an invalid step"):
-        write_shard(tmp_path / "shard", [scene], [("made", 0)])
-    assert not list(tmp_path.iterdir())
+        encode(scene)
+
+
+def test_points_out_of_order_are_refused() -> None:
+    scene = straight_road()
+    scene.road.start = scene.road.start.flip(0)
+    with pytest.raises(SceneError, match="do not lie behind each other"):
+        encode(scene)
+
+
+@settings(max_examples=200, deadline=None)
+@given(place=st.floats(0, 1, exclude_max=True), change=st.integers(1, 255))
+def test_a_damaged_block_is_an_error_and_never_another_scene(place: float, change: int) -> None:
+    block = bytearray(encode(straight_road(3)))
+    block[int(place * len(block))] ^= change
+    with contextlib.suppress(SceneError):
+        assert_same(decode(bytes(block)), straight_road(3))  # bits that mean nothing
+
+
+@pytest.mark.parametrize("keep", [0, 1, 3, 20, -1])
+def test_a_cut_block_is_an_error(keep: int) -> None:
+    with pytest.raises(SceneError, match="the block of the scene"):
+        decode(encode(straight_road(3))[:keep])
 
 
 def change_json(path: Path, **changes: object) -> None:
     path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
 
 
-@pytest.mark.parametrize("name", ["manifest.json", "00000/shard.json"])
-def test_another_version_is_refused(store: SceneStore, name: str) -> None:
-    change_json(store.folder / name, version=99)
-    with pytest.raises(SceneError, match=rf"{name}: version 99 where 1"):
-        SceneStore(store.folder)
+def test_another_version_is_refused(store: SceneStore) -> None:
+    change_json(store.folders[0] / "manifest.json", version=99)
+    with pytest.raises(SceneError, match=r"manifest\.json: version 99 where 2"):
+        SceneStore(*store.folders)
+
+
+def test_a_shard_of_another_version_is_refused(store: SceneStore) -> None:
+    path = store.folders[0] / "00000.scenes"
+    path.write_bytes(path.read_bytes()[:-1] + b"\x01")
+    with pytest.raises(SceneError, match=r"00000\.scenes: no shard of version 2"):
+        SceneStore(*store.folders)
 
 
 def test_an_unfinished_conversion_is_refused(store: SceneStore) -> None:
-    change_json(store.folder / "manifest.json", complete=False)
+    change_json(store.folders[0] / "manifest.json", complete=False)
     with pytest.raises(SceneError, match="has not finished"):
-        SceneStore(store.folder)
+        SceneStore(*store.folders)
 
 
-@pytest.mark.parametrize("content", ["{", "[]", '{"version": 1}', '{"version": 1, "surprise": 2}'])
+@pytest.mark.parametrize("content", ["{", "[]", '{"version": 2}', '{"version": 2, "surprise": 2}'])
 def test_a_damaged_manifest_is_refused(store: SceneStore, content: str) -> None:
-    (store.folder / "manifest.json").write_text(content)
+    (store.folders[0] / "manifest.json").write_text(content)
     with pytest.raises(SceneError, match=r"manifest\.json"):
-        SceneStore(store.folder)
+        SceneStore(*store.folders)
 
 
 def test_a_missing_shard_or_store_is_refused(store: SceneStore) -> None:
-    (store.folder / "00001").rename(store.folder / "elsewhere")
+    (store.folders[0] / "00001.scenes").rename(store.folders[0] / "elsewhere")
     with pytest.raises(SceneError, match=r"00001.*missing"):
-        SceneStore(store.folder)
+        SceneStore(*store.folders)
     with pytest.raises(SceneError, match=r"nowhere.*missing"):
-        SceneStore(store.folder / "nowhere")
+        SceneStore(store.folders[0] / "nowhere")
 
 
-def test_a_truncated_array_is_refused_before_it_is_read(store: SceneStore) -> None:
-    path = store.folder / "00000/road/points.memmap"
-    path.write_bytes(path.read_bytes()[:-4])
-    reopened = SceneStore(store.folder)
-    with pytest.raises(SceneError, match=r"points\.memmap: \d+ bytes where \d+ are needed"):
-        reopened[0]
-    path.unlink()
-    with pytest.raises(SceneError, match=r"points\.memmap: the file is missing"):
-        SceneStore(store.folder)[0]
-
-
-@pytest.mark.parametrize("name", ["00000/road/points.memmap", "00001/agents/position.memmap"])
-def test_verify_finds_one_changed_byte(store: SceneStore, name: str) -> None:
-    store.verify()
-    path = store.folder / name
+def test_a_damaged_scene_is_named_and_the_others_stay_readable(store: SceneStore) -> None:
+    path = store.folders[0] / "00000.scenes"
     data = bytearray(path.read_bytes())
-    data[5] ^= 1
+    data[store._shards[0].record.sizes[0] + 40] ^= 1  # in the second scene
     path.write_bytes(data)
-    with pytest.raises(SceneError, match=f"{name}: the content does not fit its checksum"):
-        SceneStore(store.folder).verify()
+    with pytest.raises(SceneError, match=r"00000\.scenes, scene 1 \(red_light\): .*checksum"):
+        store[1]
+    assert_same(store[0], straight_road(3))
 
 
-def test_verify_finds_a_changed_record(store: SceneStore) -> None:
-    change_json(store.folder / "00001/shard.json", scene_ids=["other"])
-    with pytest.raises(SceneError, match=r"shard\.json: changed since"):
-        SceneStore(store.folder).verify()
+@pytest.mark.parametrize("name", ["00000.scenes", "00001.scenes"])
+@pytest.mark.parametrize("place", [0.001, 0.5])
+def test_verify_finds_one_changed_byte(store: SceneStore, name: str, place: float) -> None:
+    store.verify()
+    path = store.folders[0] / name
+    data = bytearray(path.read_bytes())
+    data[int(len(data) * place)] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(SceneError, match=f"{name}: changed since"):
+        store.verify()
+
+
+@pytest.mark.parametrize("cut", [1, 7, 40, 400])
+def test_a_cut_shard_is_refused(store: SceneStore, cut: int) -> None:
+    path = store.folders[0] / "00001.scenes"
+    path.write_bytes(path.read_bytes()[:-cut])
+    with pytest.raises(SceneError, match=r"00001\.scenes: no shard of version 2, or a cut one"):
+        Shard(path)
 
 
 if __name__ == "__main__":

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import gzip
 import struct
-from collections import defaultdict
+from collections import Counter, defaultdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from envs.scene import LightState, LinkKind, MapKind, Scene, SceneError
+from envs.scene import AgentKind, LightState, LinkKind, MapKind, Scene, SceneError
 from envs.sources.scenario import Scenario
 from envs.sources.tfrecord import frame, masked_crc
-from envs.sources.womd import METRES_PER_SECOND_PER_MPH, read_womd
+from envs.sources.womd import METRES_PER_SECOND_PER_MPH, WOMD, read_womd
 
 # --- an oracle that knows the wire format and nothing of our reader ------------------------------------------------
 
@@ -274,10 +274,12 @@ BROKEN = {
         lambda s: setattr(s.dynamic_map_states[2].lane_states[0].stop_point, "x", float("nan")),
         "light of lane 7",
     ),
-    "map point": (lambda s: setattr(s.map_features[1].road_edge.polyline[0], "x", float("nan")), "map point"),
-    "unknown feature": (lambda s: s.map_features.add(id=77), "map feature 77"),
-    "unknown edge type": (lambda s: setattr(s.map_features[1].road_edge, "type", 99), "map feature 8.*113"),
-    "unknown light": (lambda s: setattr(s.dynamic_map_states[0].lane_states[0], "state", 12), "LightState 12"),
+    "map point": (lambda s: setattr(s.map_features[1].road_edge.polyline[0], "x", float("nan")), "map feature 8"),
+    "float32 overflow": (lambda s: setattr(s.map_features[0].lane.polyline[1], "y", 1e300), "map feature 7"),
+    "speed limit": (
+        lambda s: setattr(s.map_features[0].lane, "speed_limit_mph", 1e300),
+        "map feature 7 has speed_limit",
+    ),
     "two tracks of one id": (lambda s: setattr(s.tracks[1], "id", 100), "share an id"),
     "no tracks": (lambda s: s.ClearField("tracks"), "no tracks"),
 }
@@ -314,6 +316,34 @@ def test_a_damaged_record_is_named(make_scenario, tmp_path: Path, damage, messag
     next(scenes)
     with pytest.raises(SceneError, match=rf"two\.tfrecord, record 1: .*{message}"):
         next(scenes)
+
+
+def test_what_the_format_does_not_know_is_counted_and_not_dropped_silently(make_scenario, tmp_path: Path) -> None:
+    scenario = make_scenario()
+    scenario.tracks[1].object_type = 9
+    scenario.map_features[0].lane.type = 6  # more than the types of lanes, though a line may have it
+    scenario.map_features.add(id=77)
+    scenario.map_features.add(id=78).road_edge.type = 99
+    scenario.dynamic_map_states[0].lane_states[0].state = 12
+    unknown = bytes([0x98, 0x06, 0x01])  # field 99, a number
+    state = scenario.tracks[0].states[3]
+    state.MergeFromString(state.SerializeToString() + unknown)
+    path = tmp_path / "new.tfrecord"
+    path.write_bytes(frame(scenario.SerializeToString() + unknown))
+    notes: Counter[str] = Counter()
+    (scene,) = WOMD.scenes(str(path), notes)
+    assert scene.agents.kind.tolist() == [AgentKind.VEHICLE, AgentKind.OTHER]
+    assert scene.road.kind.tolist() == [MapKind.LANE_UNDEFINED, MapKind.EDGE_BOUNDARY, MapKind.EDGE_UNKNOWN]
+    assert scene.lights.state[0, :2].tolist() == [LightState.UNKNOWN, LightState.STOP]
+    assert notes == {
+        "track of unknown object type 9, taken as OTHER": 1,
+        "lane of unknown type 6, taken as LANE_UNDEFINED": 1,
+        "map feature of an unknown kind, left out": 1,
+        "road_edge of unknown type 99, taken as EDGE_UNKNOWN": 1,
+        "light of unknown state 12, taken as UNKNOWN": 1,
+        "unknown field Scenario.99, left out": 1,
+        "unknown field ObjectState.99, left out": 1,
+    }
 
 
 def test_cut_gzip_is_refused(make_scenario, tmp_path: Path) -> None:

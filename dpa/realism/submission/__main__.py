@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from google.protobuf.message import DecodeError
@@ -26,8 +26,7 @@ from envs.progress import progress
 from envs.scene import CURRENT_STEP
 from envs.shards import write_json
 from envs.sources.scenario import Scenario
-from envs.sources.tfrecord import offsets, open_binary, read_frame
-from envs.sources.womd import WOMD
+from envs.sources.womd import WOMD, payloads
 from envs.store import MANIFEST_FILE, SceneStore
 
 FAULTS_STATUS, BAD_INPUT_STATUS, INTERRUPTED_STATUS = 1, 2, 130
@@ -47,24 +46,15 @@ def open_present(paths: list[str]) -> Mapping[str, Present]:
         return PresentOf(SceneStore(paths[0]))
     present: dict[str, Present] = {}
     for name in progress(WOMD.find(paths), "scenes", unit="file"):
-        with open_binary(name) as file:
-            for record, payload in _records(name, file):
-                try:
-                    scenario = Scenario.FromString(payload)
-                except DecodeError as error:
-                    raise SubmissionError(f"{record}: no Scenario proto ({error}); give files of scenarios.") from None
-                present[scenario.scenario_id] = _present_in(scenario)
+        for index, read in enumerate(payloads(name)):
+            try:
+                scenario = Scenario.FromString(read())
+            except DecodeError as error:
+                raise SubmissionError(
+                    f"{name}, record {index}: no Scenario proto ({error}); give files of scenarios."
+                ) from None
+            present[scenario.scenario_id] = _present_in(scenario)
     return present
-
-
-def _records(name: str, file: BinaryIO) -> Iterator[tuple[str, bytes]]:
-    """Name and bytes of each scenario of a WOMD file: a TFRecord, or one bare proto."""
-    if name.removesuffix(".gz").endswith((".binproto", ".pb")):
-        yield name, file.read()
-        return
-    for number, offset in enumerate(offsets(name)):
-        record = f"{name}, record {number}"
-        yield record, read_frame(file, offset, record)
 
 
 def _present_in(scenario: Any) -> Present:

@@ -100,6 +100,7 @@ def scene_from_npz(data: dict[str, np.ndarray], *, moved: bool) -> Scene:
         road=_road(data, origin),
         lights=lights_from_npz(data, origin),
         origin=origin,
+        lacks=torch.tensor(0),
         scene_id=str(data["scenario_id"]),
         batch_size=[],
     )

@@ -119,6 +119,7 @@ def test_padding_changes_nothing(golden_scene) -> None:
         road=padded.road[0],
         lights=padded.lights[0],
         origin=padded.origin[0],
+        lacks=padded.lacks[0],
         scene_id=scene.scene_id,
         batch_size=[],
     )

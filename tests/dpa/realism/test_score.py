@@ -133,7 +133,7 @@ def test_scenarios_come_from_a_store_as_from_their_file(tmp_path: Path, shared: 
     raw = shared / "realism/golden/raw/synth_b.scenario.binproto"
     store: SceneStore = convert("womd", [raw], tmp_path / "store")
     rollouts = ROLLOUTS / "synth_b__constvel.npz"
-    assert score(store.folder, rollouts)["synth_b"] == score(raw, rollouts)["synth_b"]
+    assert score(store.folders[0], rollouts)["synth_b"] == score(raw, rollouts)["synth_b"]
 
 
 def broken(tmp_path: Path, **changes: np.ndarray | None) -> Path:

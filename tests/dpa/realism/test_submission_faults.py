@@ -17,10 +17,8 @@ from dpa.realism.submission import CorruptError, SubmissionReader, encode_rollou
 from dpa.realism.submission.__main__ import main
 from dpa.realism.submission.messages import SimAgentsChallengeSubmission, SimulatedTrajectory
 from envs.scene import CURRENT_STEP, Scene
-from envs.shards import file_digest, write_shard
 from envs.sources.scenario import Scenario
 from envs.sources.tfrecord import frame
-from envs.store import Manifest, write_manifest
 from tests.dpa.realism.submissions import IDS, METADATA, ROLLOUTS, SCENES, shard_bytes, write
 
 
@@ -292,11 +290,8 @@ def test_the_command_checks_against_scenario_files(
     assert fault["message"] in capsys.readouterr().out
 
 
-def test_the_command_checks_against_a_store(tmp_path: Path, archive: Path) -> None:
-    write_shard(tmp_path / "00000", SCENES, [(name, 0) for name in IDS])
-    shards = [{"name": "00000", "scenes": len(SCENES), "sha256": file_digest(tmp_path / "00000" / "shard.json")}]
-    write_manifest(tmp_path, Manifest("synthetic", {}, plan="", complete=True, shards=shards))
-    assert main(["validate", str(archive), "--scenes", str(tmp_path)]) == 0
+def test_the_command_checks_against_a_store(tmp_path: Path, write_store, archive: Path) -> None:
+    assert main(["validate", str(archive), "--scenes", str(write_store(tmp_path / "store", SCENES))]) == 0
 
 
 def test_info_says_what_a_submission_holds(archive: Path, capsys: pytest.CaptureFixture) -> None:

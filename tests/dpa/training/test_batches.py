@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from dpa.policy import ContextOptions, make_context
 from dpa.tokens import VerletTokenizer
 from dpa.training.batches import Item, ShuffledOrder, collate_items, crop_agents, log_item, micro_batches
-from dpa.training.seeding import make_generator
+from envs.seeding import make_generator
 from envs.sources.synthetic import build_scene, straight_road
 
 

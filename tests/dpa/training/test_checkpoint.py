@@ -24,7 +24,8 @@ from dpa.training.checkpoint import (
     save_policy,
 )
 from dpa.training.optim import clip_and_step, make_optimizer, make_schedule
-from dpa.training.seeding import make_generator, seed_everything
+from dpa.training.seeding import seed_everything
+from envs.seeding import make_generator
 
 CONFIG = {"width": 8, "layers": [8, 8]}
 

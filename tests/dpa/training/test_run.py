@@ -11,7 +11,8 @@ from torch import nn
 from dpa.training.loggers import read_curve
 from dpa.training.optim import clip_and_step, make_optimizer, make_schedule
 from dpa.training.run import Run
-from dpa.training.seeding import make_generator, seed_everything
+from dpa.training.seeding import seed_everything
+from envs.seeding import make_generator
 
 STEPS = 10
 

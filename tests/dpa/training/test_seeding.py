@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from dpa.training.seeding import derive_seed, make_generator, seed_everything
+from dpa.training.seeding import seed_everything
+from envs.seeding import derive_seed, make_generator
 
 
 def test_all_global_generators_repeat_after_seeding() -> None:

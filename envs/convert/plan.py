@@ -1,0 +1,136 @@
+"""What a conversion has to do, before any scene is read: which records of which inputs go into which shards."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import astuple, dataclass, field
+from itertools import islice
+from pathlib import Path
+
+from envs.scene import SceneError
+from envs.shards import SUFFIX
+from envs.sources import Source
+
+BYTES_PER_SCENE = 1_000_000
+"""Of a raw WOMD file; a first guess at the scenes of an input that only reading could count."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Some consecutive records of one input.
+
+    Attributes:
+        input: the file, or what a generator is told.
+        size: bytes of the whole input; a file of another size is another file.
+        start: first record.
+        stop: one after the last; None to the end of an input that only reading can count.
+    """
+
+    input: str
+    size: int
+    start: int
+    stop: int | None
+
+
+@dataclass(frozen=True)
+class Task:
+    """Work of one process at a time; small, so that it travels to a worker.
+
+    Attributes:
+        source: name of the source.
+        number: place in the plan.
+        pieces: their records in order: one shard of them, or as many as a piece without end needs.
+        out: folder of the store.
+        shard_size: most records of a shard.
+        skip_bad: note records that give no scene instead of failing.
+    """
+
+    source: str
+    number: int
+    pieces: tuple[Piece, ...]
+    out: Path = field(repr=False)
+    shard_size: int
+    skip_bad: bool
+
+    @property
+    def is_open(self) -> bool:
+        """Whether only reading can tell how many shards it gives."""
+        return self.pieces[-1].stop is None
+
+    @property
+    def num_expected(self) -> int:
+        """Records, estimated where they cannot be counted."""
+        if self.is_open:
+            return max(1, self.pieces[0].size // BYTES_PER_SCENE)
+        return sum(piece.stop - piece.start for piece in self.pieces)
+
+    def path(self, part: int) -> Path:
+        """Of one of its shards."""
+        return self.out / (f"{self.number:05d}-{part:04d}{SUFFIX}" if self.is_open else f"{self.number:05d}{SUFFIX}")
+
+    def paths(self) -> Iterator[Path]:
+        """Of the shards that are there already, in order."""
+        for part in range(10_000 if self.is_open else 1):
+            if not self.path(part).exists():
+                return
+            yield self.path(part)
+
+
+def make_plan(
+    source: Source, paths: Sequence[str], out: Path, *, shard_size: int, limit: int | None, skip_bad: bool
+) -> list[Task]:
+    """Tasks in the order of the store; they depend on the inputs and options alone.
+
+    Inputs whose scenes can be counted are cut into shards of equal size across their borders; any other one is a task
+    of its own, to be read in one pass.
+
+    Args:
+        source: of the inputs.
+        paths: what the user named.
+        out: folder of the store.
+        shard_size: most records of a shard.
+        limit: take only so many records, the first ones (inputs that cannot be counted are then read to count them).
+        skip_bad: note records that give no scene instead of failing.
+
+    Raises:
+        SceneError: nothing there, or an input that cannot be opened.
+    """
+    groups: list[list[Piece]] = []
+    room, left = 0, limit
+    for name in source.find(paths):
+        size, count = source.size(name), source.count(name)
+        if left is not None:
+            count = min(left, count) if count is not None else sum(1 for _ in islice(source.records(name), left))
+            left -= count
+        if count is None:
+            groups.append([Piece(name, size, 0, None)])
+            room = 0
+            continue
+        for start, stop in _cuts(count, room, shard_size):
+            if room == 0:
+                groups.append([])
+                room = shard_size
+            groups[-1].append(Piece(name, size, start, stop))
+            room -= stop - start
+        if left == 0:
+            break
+    if not groups:
+        raise SceneError(f"{', '.join(paths)}: no scenes in there; give inputs of the source {source.name}.")
+    return [Task(source.name, number, tuple(pieces), out, shard_size, skip_bad) for number, pieces in enumerate(groups)]
+
+
+def _cuts(count: int, room: int, shard_size: int) -> Iterator[tuple[int, int]]:
+    """Cut ``count`` records where shards end, the first of which has room for ``room`` more."""
+    start = 0
+    while start < count:
+        stop = min(count, start + (room or shard_size))
+        yield start, stop
+        start, room = stop, 0
+
+
+def digest(tasks: Sequence[Task]) -> str:
+    """What makes the plan this one: the inputs, their sizes and their order."""
+    pieces = [astuple(piece) for task in tasks for piece in task.pieces]
+    return hashlib.sha256(json.dumps(pieces).encode()).hexdigest()
