@@ -6,7 +6,7 @@ from pathlib import Path
 
 from envs.card import Card, card_text
 from envs.render.card import draw_card
-from envs.render.picture import save_picture
+from envs.render.save import save_picture
 from envs.shards import read_record, write_bytes
 from envs.store import Manifest, SceneStore
 

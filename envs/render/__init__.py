@@ -5,11 +5,12 @@ rollout) and :func:`draw_agents` (one per step). :func:`draw_scene` is all of th
 once and then only what moves. From a shell::
 
     python -m envs.render STORE --scene 637f20cafde22ff8 --out scene.png
-    python -m envs.render STORE --scene 0 --out scene.gif
+    python -m envs.render STORE --scene 0 --out scene.mp4
 """
 
 from envs.render.layers import View, box_corners, draw_agents, draw_map, draw_trails, fit_view, frame_view, pose_tracks
-from envs.render.picture import draw_scene, render_frame, render_frames, save_picture
+from envs.render.picture import draw_scene, render_frame, render_frames
+from envs.render.save import save_picture
 
 __all__ = [
     "View",

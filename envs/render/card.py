@@ -67,6 +67,7 @@ def _draw_lights(axes: Axes, card: Card) -> None:
     every = sum(totals.values())
     shares = [100 * count / every if every else 0.0 for count in totals.values()]
     axes.bar(list(totals), shares, color=[color for _, color in LIGHT_STYLE.values()])
+    axes.set_ylim(0, 100)
     scenes = card.counts["scenes"]
     axes.set_title(f"states of lights [%], {scenes['with lights']} of {scenes['all']} scenes have lights")
 

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
-from PIL import Image
 from torch import Tensor
 
 from envs.render.layers import View, draw_agents, draw_map, draw_trails, fit_view, frame_view, pose_tracks
@@ -128,51 +124,6 @@ def render_frame(
         (300, 300, 3)
     """
     return next(render_frames(scene, trajectories, steps=[step], view=view, trails=trails, pixels=pixels))
-
-
-def save_picture(path: str | Path, frames: Iterable[NDArray[np.uint8]], *, frame_seconds: float = STEP_SECONDS) -> None:
-    """Write one frame as PNG, or many as a GIF that loops; the file appears whole or not at all.
-
-    Args:
-        path: ends in ``.png`` or ``.gif``.
-        frames: ``[H, W, 3]`` uint8 each; exactly one for a PNG.
-        frame_seconds: how long a GIF shows a frame [s].
-
-    Raises:
-        ValueError: another ending, or a PNG of several frames.
-    """
-    path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in (".png", ".gif"):
-        raise ValueError(f"a picture must end in .png or .gif, got {path}.")
-    images = [Image.fromarray(frame) for frame in frames]
-    if not images or (suffix == ".png" and len(images) > 1):
-        raise ValueError(f"{path}: {len(images)} frames; a PNG holds exactly one, a GIF one or more.")
-    part = path.with_name(path.name + ".part")
-    if suffix == ".png":
-        images[0].save(part, format="PNG", optimize=True)
-    else:
-        # One palette for all frames: a palette of its own for each one makes the still map flicker.
-        palette = _palette(images[len(images) // 2])
-        still = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-        duration = round(frame_seconds * 1000)
-        still[0].save(part, format="GIF", save_all=True, append_images=still[1:], duration=duration, loop=0)
-    os.replace(part, path)
-
-
-def _palette(image: Image.Image) -> Image.Image:
-    """256 colours: every colour that has a meaning, in steps towards white, and what else the picture is made of.
-
-    Colours chosen by area alone lose a cyclist of a few pixels, who then turns into a vehicle.
-    """
-    names = [SDC_COLOR, *AGENT_COLORS.values(), *(color for _, color in LIGHT_STYLE.values())]
-    hues = np.array([to_rgb(name) for name in dict.fromkeys(names)]) * 255
-    shades = hues + (255 - hues) * np.linspace(0, 0.9, 12)[:, None, None]
-    meaning = np.round(shades).astype(np.uint8).reshape(-1).tolist()
-    rest = image.quantize(256 - len(meaning) // 3, dither=Image.Dither.NONE).getpalette() or []
-    palette = Image.new("P", (1, 1))
-    palette.putpalette((meaning + rest)[: 256 * 3])
-    return palette
 
 
 def _draw_moment(axes: Axes, scene: Scene, tracks: Tensor, step: int, *, trails: bool, clock: bool) -> list[Artist]:

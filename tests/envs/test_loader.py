@@ -345,9 +345,13 @@ def test_workers_change_nothing_and_the_state_counts_what_was_handed_out(store: 
 
 
 def test_an_error_in_a_worker_arrives_as_what_it_is(store: SceneStore) -> None:
-    (store.folders[0] / "00000.scenes").unlink()
-    with pytest.raises(SceneError, match=r"00000\.scenes, scene \d+ .*No such file"):
-        next(iter(SceneLoader(store, 4, workers=1)))
+    path = store.folders[0] / "00000.scenes"
+    data = bytearray(path.read_bytes())
+    for byte in range(10, 18):  # in the first scene
+        data[byte] ^= 255
+    path.write_bytes(data)
+    with pytest.raises(SceneError, match=r"00000\.scenes, scene 0 \(scene_0\)"):
+        list(SceneLoader(store, 4, workers=1))
 
 
 if __name__ == "__main__":

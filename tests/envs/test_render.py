@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -146,10 +147,27 @@ def test_pictures_are_written_whole_as_png_and_gif(tmp_path: Path) -> None:
     save_picture(tmp_path / "all.gif", frames)
     with Image.open(tmp_path / "all.gif") as gif:
         assert (gif.n_frames, gif.info["duration"], gif.size) == (3, 100, (120, 120))
-    for name, refused in (("two.png", frames), ("film.mp4", frames), ("none.gif", [])):
+    for name, refused in (("two.png", frames), ("film.avi", frames), ("none.gif", [])):
         with pytest.raises(ValueError, match=name):
             save_picture(tmp_path / name, refused)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["all.gif", "one.png"]
+
+
+def test_a_film_has_every_frame_in_even_sides(tmp_path: Path) -> None:
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the extra video")
+    save_picture(tmp_path / "all.mp4", render_frames(straight_road(), steps=range(0, 12, 4), pixels=121))
+    assert [file.name for file in tmp_path.iterdir()] == ["all.mp4"]
+    film = imageio_ffmpeg.read_frames(str(tmp_path / "all.mp4"))
+    facts = next(film)
+    assert facts["size"] == (120, 120) and facts["fps"] == 10
+    assert len(list(film)) == 3
+
+
+def test_a_film_without_its_extra_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(ImportError, match=r"dpa-omf\[video\]"):
+        save_picture(tmp_path / "all.mp4", render_frames(straight_road(), steps=[1, 2], pixels=120))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_gif_keeps_the_colour_of_a_class_that_is_a_few_pixels_large(tmp_path: Path) -> None:
@@ -169,10 +187,13 @@ def store(tmp_path: Path, write_store: Callable) -> Path:
     return write_store(tmp_path / "store", [straight_road(1), two_cars_head_on()])
 
 
-def test_the_command_finds_a_scene_by_id_and_by_index(store: Path, tmp_path: Path) -> None:
+def test_the_command_finds_a_scene_by_id_and_by_index(store: Path, tmp_path: Path, monkeypatch, capsys) -> None:
     for name in ("two_cars_head_on", "1"):
         command_line.main([str(store), "--scene", name, "--out", str(tmp_path / f"{name}.png"), "--pixels", "120"])
     assert (tmp_path / "1.png").read_bytes() == (tmp_path / "two_cars_head_on.png").read_bytes()
+    monkeypatch.chdir(tmp_path)
+    command_line.main([str(store), "--scene", "1", "--pixels", "120"])
+    assert capsys.readouterr().out.splitlines()[-1] == "two_cars_head_on.png"
     command_line.main([str(store), "--scene", "0", "--out", str(tmp_path / "film.gif"), "--pixels", "80"])
     with Image.open(tmp_path / "film.gif") as gif:
         # Pillow may merge equal frames, but the cars move in every step.
