@@ -80,7 +80,12 @@ def _write_mp4(part: Path, frames: Iterable[Frame], frame_seconds: float) -> Non
         height, width = (side - side % 2 for side in frame.shape[:2])  # the codec takes even sides only
         if writer is None:
             writer = imageio_ffmpeg.write_frames(
-                str(part), (width, height), fps=1 / frame_seconds, quality=8, output_params=["-f", "mp4"]
+                str(part),
+                (width, height),
+                fps=1 / frame_seconds,
+                quality=8,
+                macro_block_size=2,
+                output_params=["-f", "mp4"],
             )
             writer.send(None)
         writer.send(np.ascontiguousarray(frame[:height, :width]))
