@@ -155,7 +155,7 @@ def _pack(rows: np.ndarray, column: _Column) -> bytes:
     bits = np.ascontiguousarray(rows.reshape(len(rows), column.per_row).T).view(f"<u{width}")
     for _ in range(column.order):
         bits = np.diff(bits, axis=-1, prepend=bits.dtype.type(0))
-    return np.ascontiguousarray(bits.reshape(-1).view(np.uint8).reshape(-1, width).T).tobytes()
+    return bits.reshape(-1).view(np.uint8).reshape(-1, width).T.tobytes()
 
 
 def _unpack(data: memoryview, num_rows: int, column: _Column) -> np.ndarray:
@@ -166,7 +166,10 @@ def _unpack(data: memoryview, num_rows: int, column: _Column) -> np.ndarray:
         return flags.astype(bool).reshape(shape)
     width = np.dtype(column.dtype).itemsize
     planes = np.frombuffer(data, np.uint8).reshape(width, -1)
-    bits = np.array(planes.T, order="C").view(f"<u{width}").reshape(column.per_row, num_rows)
+    whole = np.empty((planes.shape[1], width), np.uint8)
+    for place, plane in enumerate(planes):  # four times as fast as a copy of planes.T
+        whole[:, place] = plane
+    bits = whole.view(f"<u{width}").reshape(column.per_row, num_rows)
     for _ in range(column.order):
         bits = np.cumsum(bits, axis=-1, dtype=bits.dtype)
     return np.ascontiguousarray(bits.T).view(column.dtype).reshape(shape)
@@ -187,9 +190,7 @@ def _scene(arrays: dict[str, np.ndarray], scene_id: str) -> Scene:
     for name in _AT_VALID_STATES:
         if len(arrays[name]) != np.count_nonzero(valid):
             raise SceneError(f"the block of scene {scene_id} has {len(arrays[name])} states of {valid.sum()}.")
-        filled = np.zeros((*valid.shape, *arrays[name].shape[1:]), arrays[name].dtype)
-        filled[valid] = arrays[name]
-        arrays[name] = filled
+        arrays[name] = _spread(arrays[name], valid)
     for name in ("lights.state", "lights.stop_point"):
         arrays[name] = arrays[name].reshape(-1, LOG_STEPS, *arrays[name].shape[1:])
     arrays["road.start"] = np.cumsum(count) - count
@@ -199,3 +200,11 @@ def _scene(arrays: dict[str, np.ndarray], scene_id: str) -> Scene:
         for part, cls in _PARTS.items()
     }
     return Scene(**parts, origin=tensors["origin"][0], lacks=tensors["lacks"][0], scene_id=scene_id, batch_size=[])
+
+
+def _spread(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """States at their places, zero elsewhere; a state is moved as one item, which is far faster than by its numbers."""
+    item = np.dtype((np.void, states.dtype.itemsize * math.prod(states.shape[1:])))
+    filled = np.zeros(valid.size, item)
+    filled[np.flatnonzero(valid)] = np.ascontiguousarray(states).reshape(len(states), -1).view(item)[:, 0]
+    return filled.view(states.dtype).reshape(valid.shape + states.shape[1:])

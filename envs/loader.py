@@ -10,7 +10,7 @@ import atexit
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -24,6 +24,8 @@ from envs.seeding import make_generator
 
 Key = tuple[int, list[int]]
 """What makes a batch: the epoch and the indices of its scenes."""
+Prepare = Callable[[Scene, torch.Generator], Any]
+UNCHANGED = Augmentation()
 
 
 class SceneLoader:
@@ -41,8 +43,10 @@ class SceneLoader:
         scenes: a store or a list. ``blocks``, the number of scenes of each consecutive block of indices, and
             ``scene_ids`` are used where it has them; otherwise it is one block, and only its size is checked on resume.
         batch_size: scenes of a batch of this rank.
-        seed: of the order and of the augmentation.
-        augment: changes each scene with a generator made from the seed, the epoch and the index of the scene.
+        seed: of the order and of the generators.
+        prepare: called with each scene and a generator made from the seed, the epoch and the index of the scene: an
+            :class:`~envs.augment.Augmentation`, or whatever turns a scene into a training item.
+        collate: called with what was prepared for a batch.
         rank: of this process.
         world_size: number of ranks.
         block_window: blocks whose scenes are shuffled among each other; more mix better and touch more files.
@@ -57,7 +61,7 @@ class SceneLoader:
     Examples:
         >>> from envs.sources.synthetic import straight_road
         >>> scenes = [straight_road(2, seed=seed) for seed in range(6)]
-        >>> loader = SceneLoader(scenes, batch_size=2, augment=Augmentation(mirror=0.5))
+        >>> loader = SceneLoader(scenes, batch_size=2, prepare=Augmentation(mirror=0.5))
         >>> for epoch in range(loader.epoch, 2):
         ...     print(epoch, [batch.agents.position.shape[0] for batch in loader])
         0 [2, 2, 2]
@@ -67,7 +71,7 @@ class SceneLoader:
 
         >>> batches = iter(loader)
         >>> first, state = next(batches), loader.state_dict()
-        >>> resumed = SceneLoader(scenes, batch_size=2, augment=Augmentation(mirror=0.5))
+        >>> resumed = SceneLoader(scenes, batch_size=2, prepare=Augmentation(mirror=0.5))
         >>> resumed.load_state_dict(state)
         >>> next(iter(resumed)).scene_id == next(batches).scene_id
         True
@@ -79,7 +83,8 @@ class SceneLoader:
         batch_size: int = 64,
         *,
         seed: int = 0,
-        augment: Augmentation | None = None,
+        prepare: Prepare = UNCHANGED,
+        collate: Callable[[list[Any]], Any] = collate,
         rank: int = 0,
         world_size: int = 1,
         block_window: int = 4,
@@ -103,7 +108,7 @@ class SceneLoader:
         self._epoch = self._consumed = 0
         self._loop: object | None = None
         self._keys: list[Key] = []
-        self._batches = _prefetched(_Batches(scenes, augment, seed), self._keys, workers)
+        self._batches = _prefetched(_Batches(scenes, prepare, collate, seed), self._keys, workers)
 
     def __len__(self) -> int:
         """Batches of an epoch, on every rank."""
@@ -114,7 +119,7 @@ class SceneLoader:
         """Epoch of the next batch: within the body of a loop, the last batch of an epoch has ended it already."""
         return self._epoch
 
-    def __iter__(self) -> Iterator[Scene]:
+    def __iter__(self) -> Iterator[Any]:
         """What is left of the current epoch, as collated scenes ``[S]``.
 
         Raises:
@@ -128,7 +133,7 @@ class SceneLoader:
             if self._loop is not loop:
                 raise RuntimeError("this loop over the loader has ended: a newer one began, or a state was loaded.")
 
-    def endless(self) -> Iterator[Scene]:
+    def endless(self) -> Iterator[Any]:
         """Batches of one epoch after the other, for ever."""
         while True:
             yield from self
@@ -140,8 +145,8 @@ class SceneLoader:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go to where another loader was; the next loop begins there.
 
-        Ranks, batch size, ``drop_last`` and augmentation may differ and are not checked. At an equal global batch size
-        exactly the scenes follow that would have come.
+        Ranks, batch size, ``drop_last`` and what is done to each scene may differ and are not checked. At an equal
+        global batch size exactly the scenes follow that would have come.
 
         Args:
             state: of :meth:`state_dict`.
@@ -211,23 +216,20 @@ def epoch_order(blocks: Sequence[int], window: int, seed: int, epoch: int) -> Te
 
 
 class _Batches(Dataset):
-    """Loads, augments and collates; all that a worker needs to know."""
+    """Loads, prepares and collates; all that a worker needs to know."""
 
-    def __init__(self, scenes: SceneSource, augment: Augmentation | None, seed: int) -> None:
-        self.scenes, self.augment, self.seed = scenes, augment, seed
+    def __init__(self, scenes: SceneSource, prepare: Prepare, collate: Callable[[list[Any]], Any], seed: int) -> None:
+        self.scenes, self.prepare, self.collate, self.seed = scenes, prepare, collate, seed
 
-    def __getitem__(self, key: Key) -> Scene:
+    def __getitem__(self, key: Key) -> Any:
         epoch, indices = key
-        return collate([self._scene(epoch, index) for index in indices])
+        return self.collate([self._prepared(epoch, index) for index in indices])
 
-    def _scene(self, epoch: int, index: int) -> Scene:
-        scene = self.scenes[index]
-        if self.augment is None:
-            return scene
-        return self.augment(scene, make_generator(self.seed, "augment", epoch, index))
+    def _prepared(self, epoch: int, index: int) -> Any:
+        return self.prepare(self.scenes[index], make_generator(self.seed, "prepare", epoch, index))
 
 
-def _prefetched(batches: _Batches, keys: list[Key], workers: int) -> Iterable[Scene]:
+def _prefetched(batches: _Batches, keys: list[Key], workers: int) -> Iterable[Any]:
     """The batches of the keys that the list holds when an iteration begins."""
     return DataLoader(
         batches,
@@ -244,7 +246,7 @@ def _prefetched(batches: _Batches, keys: list[Key], workers: int) -> Iterable[Sc
     )
 
 
-def _as_it_is(batch: Scene) -> Scene:
+def _as_it_is(batch: Any) -> Any:
     return batch
 
 

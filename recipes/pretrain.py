@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import hydra
@@ -18,17 +19,18 @@ from omegaconf import DictConfig
 from tensordict import TensorDict
 
 from dpa.losses import NextTokenLoss, token_network
-from dpa.policy import MotionLM, make_context
-from dpa.training.batches import Item, ShuffledOrder, collate_items, crop_agents, log_item, micro_batches
+from dpa.policy import MotionLM
+from dpa.training.batches import Item, LogReader, collate_items, micro_batches
 from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
 from dpa.training.run import Run
 from dpa.training.seeding import seed_everything
 from envs import keys
-from envs.augment import mirror
+from envs.augment import Augmentation
+from envs.loader import SceneLoader
 from envs.progress import progress
 from envs.scene import SceneSource
 from envs.seeding import make_generator
-from recipes.cli import CONFIG, check_steps, finished, plain, recipe, write_json
+from recipes.cli import CONFIG, build, check_steps, finished, plain, recipe, write_json
 from recipes.models import build_policy, context_options, policy_config, write_policy
 from recipes.scenes import Splits, fingerprint, open_splits
 
@@ -53,13 +55,13 @@ def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path) -> Path:
     seed_everything(seed)
     model = build_policy(config).to(cfg.device)
     best = copy.deepcopy(model)
-    train = log_items(splits.train, cfg, model, copies=options.copies, noise=options.noise, mirrored=options.mirror)
-    tune = log_items(splits.tune, cfg, model)
+    read = log_reader(cfg, model)
+    train = training_items(splits.train, options, read, seed)
+    tune = log_items(splits.tune, replace(read, augment=Augmentation(), noise=0.0))
     loss = NextTokenLoss(token_network(model), label_smoothing=options.label_smoothing)
     loss.set_keys(labels=keys.LABELS)
     optimizer = make_optimizer(model, options.lr, options.weight_decay)
     schedule = make_schedule(optimizer, options.steps, options.warmup)
-    order = ShuffledOrder(len(train), options.batch_size, seed)
     run = Run(
         folder,
         {"policy": model, "best": best, "optimizer": optimizer, "schedule": schedule},
@@ -71,15 +73,18 @@ def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path) -> Path:
         description="pretrain",
     )
     run.state.setdefault("best_nll", float("inf"))
+    if "train" in run.state:
+        train.load_state_dict(run.state["train"])
+    batches = train.endless()
     with run:
         for step in run.steps():
-            crop = make_generator(seed, "crop", step)
-            items = [crop_agents(train[i], options.max_agents, crop) for i in order(step)]
+            items = next(batches)
+            run.state["train"] = train.state_dict()
             losses = accumulate_gradients(loss, parts_of(items, options.max_rows, cfg.device))
             norm = clip_and_step(optimizer, options.max_norm, schedule)
             run.log({f"train/{key}": value for key, value in losses.items()} | {"train/gradient_norm": norm})
             if (step + 1) % options.tune_interval == 0 or step + 1 == options.steps:
-                measured = negative_log_likelihood(model, tune, options.max_agents, cfg.device)
+                measured = negative_log_likelihood(model, tune, cfg.device)
                 run.log({f"tune/{key}": value for key, value in measured.items()})
                 if measured["nll"] < run.state["best_nll"]:
                     run.state["best_nll"] = measured["nll"]
@@ -97,36 +102,52 @@ def parts_of(items: list[Item], max_rows: int, device: str) -> Iterator[tuple[Te
         yield collate_items([items[i] for i in part]).to(device), share
 
 
-def log_items(
-    scenes: SceneSource,
-    cfg: DictConfig,
-    model: MotionLM,
-    *,
-    copies: int = 1,
-    noise: float = 0.0,
-    mirrored: bool = False,
-) -> list[Item]:
-    """Tokenized logs of all scenes: ``copies`` with noise of their own, and as many of their mirror images."""
-    options, tokenizer = context_options(cfg.model), copy.deepcopy(model.tokenizer).cpu()
-    items = []
-    for index in progress(range(len(scenes)), "tokens", unit="scene"):
-        scene, draw = scenes[index], make_generator(0, "noise", index)
-        for image in [scene, mirror(scene)] if mirrored else [scene]:
-            context = make_context(image, options)
-            items += [log_item(context, tokenizer, noise=noise, generator=draw) for _ in range(copies)]
+def log_reader(cfg: DictConfig, model: MotionLM) -> LogReader:
+    """What turns a scene into a training item, as the options say."""
+    options = cfg.pretraining
+    return LogReader(
+        tokenizer=copy.deepcopy(model.tokenizer).cpu(),
+        options=context_options(cfg.model),
+        augment=build(Augmentation, options.augmentation, "pretraining.augmentation"),
+        noise=options.noise,
+        max_agents=options.max_agents,
+    )
+
+
+def training_items(scenes: SceneSource, options: DictConfig, read: LogReader, seed: int) -> SceneLoader:
+    """Lists of tokenized logs, read from the store as they are needed: memory does not grow with the scenes."""
+    return SceneLoader(
+        scenes,
+        options.batch_size,
+        seed=seed,
+        prepare=read,
+        collate=with_tokens,
+        workers=options.workers,
+        drop_last=False,
+    )
+
+
+def with_tokens(items: list[Item]) -> list[Item]:
+    """Those that have something to predict; without them the loss of a batch would be 0 / 0."""
     return [item for item in items if item.token_valid.any()]
 
 
+def log_items(scenes: SceneSource, read: LogReader) -> list[Item]:
+    """Tokenized logs of a few scenes, always the same."""
+    bar = progress(range(len(scenes)), "tokens", unit="scene")
+    return with_tokens([read(scenes[index], make_generator(0, "tune", index)) for index in bar])
+
+
 @torch.no_grad()
-def negative_log_likelihood(model: MotionLM, items: list[Item], max_agents: int, device: str) -> dict[str, float]:
+def negative_log_likelihood(model: MotionLM, items: list[Item], device: str) -> dict[str, float]:
     """Per valid token [nats]: ``nll`` of all agents and ``nll_moving`` of those whose velocity changes at all.
 
     A standing agent repeats one token and is easy; it would hide how moving agents are predicted.
     """
     model.eval()
     totals = torch.zeros(2, 2, dtype=torch.float64)
-    for index, item in enumerate(items):
-        batch = collate_items([crop_agents(item, max_agents, make_generator(0, "tune", index))]).to(device)
+    for item in items:
+        batch = collate_items([item]).to(device)
         tokens, valid = batch["tokens"], batch["token_valid"]
         logits = model(batch["context"], tokens, valid)
         nll = -logits.log_softmax(-1).gather(-1, tokens[..., None])[..., 0].cpu()

@@ -19,7 +19,7 @@ from envs.convert.__main__ import make_parser as convert_parser
 from envs.sources import SOURCES
 from envs.sources.sumo import parse, units
 from recipes.align import LOSSES
-from recipes.benchmark import make_parser as benchmark_parser
+from recipes.benchmark.__main__ import make_parser as benchmark_parser
 from recipes.models import TOKENIZERS
 
 REPOSITORY = Path(__file__).resolve().parents[1]

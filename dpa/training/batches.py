@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -10,9 +11,11 @@ from tensordict import TensorDict
 from torch import Tensor
 from torch.nn import functional as F
 
-from dpa.policy.context import SceneContext, collate_contexts, keep_agents
+from dpa.policy.context import ContextOptions, SceneContext, collate_contexts, keep_agents, make_context
 from dpa.tokens.base import MotionTokenizer
 from envs import keys
+from envs.augment import Augmentation
+from envs.scene import Scene
 from envs.seeding import make_generator
 
 
@@ -55,6 +58,41 @@ def log_item(
     )
     valid = tracks.valid & context.controlled[:, None]
     return Item(context, tracks.tokens[None], valid, tracks.labels[None])
+
+
+@dataclass(frozen=True)
+class LogReader:
+    """Scene -> item for pre-training, with augmentation and noise drawn anew each time that the scene comes up.
+
+    A :class:`~envs.loader.SceneLoader` takes it as ``prepare``; it travels to the loader's workers.
+
+    Attributes:
+        tokenizer: on the CPU.
+        options: of :func:`~dpa.policy.make_context`.
+        augment: of scenes.
+        noise: see :func:`log_item`.
+        max_agents: see :func:`crop_agents`.
+
+    Examples:
+        >>> from dpa.policy import ContextOptions
+        >>> from dpa.tokens import VerletTokenizer
+        >>> from envs.sources.synthetic import straight_road
+        >>> read = LogReader(VerletTokenizer(), ContextOptions(), Augmentation(mirror=0.5), noise=0.0, max_agents=2)
+        >>> read(straight_road(3), torch.Generator().manual_seed(0)).tokens.shape
+        torch.Size([1, 2, 16])
+    """
+
+    tokenizer: MotionTokenizer
+    options: ContextOptions
+    augment: Augmentation
+    noise: float
+    max_agents: int
+
+    def __call__(self, scene: Scene, generator: torch.Generator) -> Item:
+        """The item of one scene."""
+        context = make_context(self.augment(scene, generator), self.options)
+        item = log_item(context, self.tokenizer, noise=self.noise, generator=generator)
+        return crop_agents(item, self.max_agents, generator)
 
 
 def crop_agents(item: Item, limit: int, generator: torch.Generator) -> Item:

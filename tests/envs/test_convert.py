@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import json
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -12,7 +14,9 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import fsspec
 import pytest
+from PIL import Image
 
 from envs.convert import convert
 from envs.convert.__main__ import main
@@ -22,7 +26,7 @@ from envs.sources.scenario import Scenario
 from envs.sources.synthetic import straight_road
 from envs.sources.tfrecord import frame
 from envs.sources.womd import read_womd
-from envs.store import SceneStore
+from envs.store import SceneStore, read_manifest
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -67,6 +71,62 @@ def test_inputs_may_be_files_folders_and_patterns(raw: Path, tmp_path: Path) -> 
     with pytest.raises(SceneError, match=r"empty: no input.*\.tfrecord"):
         convert("womd", [raw / "empty"], tmp_path / "three")
     assert not (tmp_path / "three").exists()
+
+
+def test_an_input_that_cannot_be_counted_is_read_in_one_pass_into_shards_of_its_own(raw: Path, tmp_path: Path) -> None:
+    files = sorted(raw.iterdir())
+    packed = raw / "b.tfrecord.gz"
+    packed.write_bytes(gzip.compress(files[1].read_bytes()))
+    store = convert("womd", [files[0], packed], tmp_path / "out", shard_size=2)
+    assert store.scene_ids == [f"scene{number}" for number in range(7)]
+    names = [entry["name"] for entry in store.manifests[0].shards]
+    assert names == ["00000.scenes", "00001.scenes", "00002-0000.scenes", "00002-0001.scenes"]
+    assert convert("womd", [packed], tmp_path / "limited", limit=3).scene_ids == ["scene3", "scene4", "scene5"]
+
+
+def test_inputs_may_lie_behind_an_address(raw: Path, tmp_path: Path) -> None:
+    memory = fsspec.filesystem("memory")
+    for file in raw.iterdir():
+        memory.pipe(f"/womd/{file.name}", file.read_bytes())
+    here, there = convert("womd", [raw], tmp_path / "here"), tmp_path / "there"
+    store = convert("womd", ["memory://womd"], there, shard_size=2)
+    assert store.scene_ids == here.scene_ids
+    assert (store[6].agents == here[6].agents).all()
+    assert store.provenance(0) == ("memory:///womd/a.tfrecord", 0)
+    assert convert("womd", ["memory://womd/b*"], tmp_path / "some").scene_ids == here.scene_ids[3:]
+    with pytest.raises(SceneError, match=r"memory://nowhere/\*: no input there"):
+        convert("womd", ["memory://nowhere/*"], tmp_path / "none")
+    with pytest.raises(SceneError, match=r"moon://x: cannot be read .*moon"):
+        convert("womd", ["moon://x"], tmp_path / "none")
+
+
+def test_a_changed_input_is_another_plan(raw: Path, tmp_path: Path) -> None:
+    convert("womd", [raw], tmp_path / "out")
+    with (raw / "a.tfrecord").open("ab") as file:
+        file.write(b"more")
+    with pytest.raises(SceneError, match="another plan"):
+        convert("womd", [raw], tmp_path / "out")
+
+
+def test_the_data_card_counts_what_the_scenes_hold(raw: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "out"
+    assert main(["womd", str(raw), str(out), "--shard-size", "2", "--split", "training"]) == 0
+    card = (out / "card.md").read_text()
+    assert "| scenes | 7 |" in card and "| split | training |" in card
+    assert "| scenes with traffic lights | 7 (100%) |" in card
+    assert "| vehicle | 13 | 1.9 | 10-11 / 10-11 m/s | 9-10 s | 90-100 m | 4.5-5 m |" in card
+    with Image.open(out / "card.png") as picture:
+        assert picture.size[0] > 1000
+    assert str(out / "card.md") in capsys.readouterr().out
+
+
+def test_what_a_reader_could_not_take_over_is_reported(make_scenario, tmp_path: Path, capsys) -> None:
+    scenario = make_scenario()
+    scenario.tracks[1].object_type = 9
+    (tmp_path / "new.tfrecord").write_bytes(frame(scenario.SerializeToString()))
+    assert main(["womd", str(tmp_path / "new.tfrecord"), str(tmp_path / "out")]) == 0
+    assert "track of unknown object type 9, taken as OTHER: 1 times" in capsys.readouterr().out
+    assert "unknown object type 9" in (tmp_path / "out/card.md").read_text()
 
 
 def test_limit_takes_the_first_scenes(raw: Path, tmp_path: Path) -> None:
@@ -249,6 +309,41 @@ def test_killed_with_two_workers_and_resumed_with_one_gives_the_same_bytes(make_
     convert("womd", [raw], whole, shard_size=4)
     assert len(SceneStore(cut)) == 100
     assert digests(cut) == digests(whole)
+
+
+def convert_and_leave(inputs: list[Path], out: Path) -> int:
+    """A process that converts, forked so that it starts at once; returns its number."""
+    child = os.fork()
+    if child == 0:
+        try:
+            convert("womd", inputs, out, shard_size=3)
+        finally:
+            os._exit(0)
+    return child
+
+
+@pytest.mark.slow
+def test_fifty_kills_at_random_moments_leave_the_bytes_of_an_undisturbed_conversion(make_scenario, tmp_path) -> None:
+    records = [make_scenario(f"scene{number}", 20).SerializeToString() for number in range(60)]
+    plain, packed = tmp_path / "plain.tfrecord", tmp_path / "packed.tfrecord.gz"
+    plain.write_bytes(b"".join(map(frame, records[:30])))
+    packed.write_bytes(gzip.compress(b"".join(map(frame, records[30:])), 1))
+    inputs = [plain, packed]
+    start = time.monotonic()
+    convert("womd", inputs, tmp_path / "whole", shard_size=3)
+    seconds, draw = time.monotonic() - start, random.Random(0)
+    whole, kills, finished = digests(tmp_path / "whole"), 0, 0
+    while kills < 50 or not finished:
+        out = tmp_path / f"cut{finished}"
+        child = convert_and_leave(inputs, out)
+        time.sleep(draw.uniform(0, seconds / 3 if kills < 50 else 10 * seconds))
+        os.kill(child, signal.SIGKILL)
+        _, status = os.waitpid(child, 0)
+        kills += os.WIFSIGNALED(status)
+        if (out / "manifest.json").exists() and read_manifest(out).complete:
+            assert digests(out) == whole
+            finished += 1
+    assert len(SceneStore(tmp_path / "cut0")) == 60
 
 
 def test_two_workers_give_the_same_bytes_as_one(raw: Path, tmp_path: Path) -> None:

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from recipes.benchmark import crowded_scene, main, noisy_log
+from envs.sources.tfrecord import frame
+from recipes.benchmark.__main__ import main
+from recipes.benchmark.realism import crowded_scene, noisy_log
 
 
 def test_a_crowded_scene_has_the_agents_and_edges_that_were_asked_for() -> None:
@@ -32,3 +34,17 @@ def test_the_metric_is_timed_on_files_of_ones_own(
 def test_a_file_that_is_not_there_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["realism", "--scenarios", "nowhere"]) == 2
     assert "nowhere does not exist" in capsys.readouterr().err
+
+
+def test_scenes_are_measured_raw_and_stored(make_scenario, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    raw, out, work = tmp_path / "raw.tfrecord", tmp_path / "out.json", tmp_path / "work"
+    work.mkdir()
+    raw.write_bytes(frame(make_scenario().SerializeToString()))
+    options = ["--copies", "3", "--workers", "1", "--batch", "4", "--repeats", "1", "--folder", str(work)]
+    assert main(["scenes", "womd", str(raw), *options, "--json", str(out)]) == 0
+    figures = {row["what"]: row["figure"] for row in json.loads(out.read_text())["rows"]}
+    assert figures["raw files"] * 1000 == pytest.approx(raw.stat().st_size, abs=10)  # ids of copies are a little longer
+    assert 0 < figures["store"] < figures["raw files"]
+    assert figures["conversion with 1 processes, start included"] > 0
+    assert "scenes of womd, 6 in all" in capsys.readouterr().out
+    assert not list(work.iterdir())

@@ -1,22 +1,12 @@
-"""How fast the parts are, and how much memory they take, on the machine at hand.
-
-    python -m recipes.benchmark realism                                # crowded scenes made on the spot
-    python -m recipes.benchmark realism --scenarios FILE --json out.json    # scenarios of your own
-
-Each case runs in a process of its own, so that its peak of memory is its own.
-"""
+"""Seconds of the realism metric per scene; each case has a process, and so a peak of memory, of its own."""
 
 from __future__ import annotations
 
 import argparse
 import multiprocessing
-import platform
 import resource
 import statistics
-import sys
 import time
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -29,7 +19,6 @@ from dpa.realism.files import Scenarios
 from envs.progress import progress
 from envs.scene import CURRENT_STEP, LOG_STEPS, MapKind, Scene
 from envs.sources.synthetic import build_scene
-from recipes.cli import write_json
 
 EVALUATED = 9
 """The SDC and eight tracks to predict: the most that WOMD has."""
@@ -153,11 +142,8 @@ def _print(rows: list[dict[str, Any]], options: dict[str, Any]) -> None:
     Console(width=110).print(table)
 
 
-def make_parser() -> argparse.ArgumentParser:
-    """The command line."""
-    parser = argparse.ArgumentParser(prog="python -m recipes.benchmark", description=__doc__.split("\n")[0])
-    parts = parser.add_subparsers(dest="part", required=True, metavar="PART")
-    part = parts.add_parser("realism", help="seconds of the realism metric per scene")
+def add_options(part: argparse.ArgumentParser) -> None:
+    """Options of ``python -m recipes.benchmark realism``."""
     part.add_argument("--scenarios", metavar="FILE", help="TFRecord, store or folder (default: crowded scenes)")
     part.add_argument("--config", default="2025", help="year of the metric (default: %(default)s)")
     part.add_argument("--num-rollouts", type=int, default=32, metavar="R", help="of a scene (default: %(default)s)")
@@ -166,25 +152,10 @@ def make_parser() -> argparse.ArgumentParser:
     part.add_argument("--repeats", type=int, default=5, metavar="N", help="the median counts (default: %(default)s)")
     part.add_argument("--threads", type=int, default=2, help="CPU threads (default: %(default)s)")
     part.add_argument("--device", default="cpu", help="cpu or cuda (default: %(default)s)")
-    part.add_argument("--json", type=Path, metavar="OUT", help="write the figures here too")
-    return parser
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
-    options = vars(make_parser().parse_args(arguments))
-    out, scenarios = options.pop("json"), options.pop("scenarios")
-    try:
-        rows = run(realism_cases(scenarios), options)
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    machine = {"processor": platform.processor() or platform.machine(), "torch": torch.__version__}
+def measure(options: dict[str, Any]) -> list[dict[str, Any]]:
+    """Run the part and print its table."""
+    rows = run(realism_cases(options["scenarios"]), options)
     _print(rows, options)
-    if out is not None:
-        write_json(out, {"options": options, "machine": machine, "rows": rows})
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return rows
