@@ -197,7 +197,7 @@ class SceneStore:
         has_lights: bool | None = None,
         source: str | None = None,
         split: str | None = None,
-        without: Lacks = Lacks.NOTHING,
+        complete_in: Sequence[str] = (),
     ) -> SceneStore:
         """A view of the scenes that fit, in their order; nothing is unpacked to tell.
 
@@ -207,12 +207,17 @@ class SceneStore:
             has_lights: with traffic lights, or without.
             source: name of the source that they came from.
             split: name that their conversion was given.
-            without: nothing of this may be lacking, for example ``Lacks.LIGHTS | Lacks.TOPOLOGY``.
+            complete_in: what no recording may lack, by the names of :class:`~envs.scene.Lacks`: ``["lights"]``.
 
         Raises:
-            ValueError: no folder has that source or split; the message names those there are.
+            ValueError: no folder has that source or split, or there is no such name; the message says which there are.
         """
-        fits = (self.num_agents >= min_agents) & (self.lacks & int(without) == 0)
+        needed = 0
+        for name in complete_in:
+            if name.upper() not in Lacks.__members__:
+                raise ValueError(f"nothing is called {name!r}; a recording may lack {', '.join(Lacks.__members__)}.")
+            needed |= Lacks[name.upper()]
+        fits = (self.num_agents >= min_agents) & (self.lacks & needed == 0)
         if max_agents is not None:
             fits &= self.num_agents <= max_agents
         if has_lights is not None:

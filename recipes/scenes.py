@@ -13,6 +13,7 @@ from envs.convert import convert
 from envs.seeding import make_generator
 from envs.shards import FORMAT_VERSION
 from envs.store import SceneStore
+from recipes.cli import build
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ def open_splits(cfg: DictConfig) -> Splits:
     Raises:
         ValueError: fewer training scenes than ``tune`` asks for, or scenes that are both trained and evaluated on.
     """
-    pool, held_out = (_open(cfg, cfg[split]) for split in ("train", "eval"))
+    pool, held_out = (_chosen(_open(cfg, cfg[split]), cfg.select, split) for split in ("train", "eval"))
     shared = sorted(set(pool.scene_ids) & set(held_out.scene_ids))
     if shared:
         raise ValueError(f"scenes.train and scenes.eval share {len(shared)} scenes (the first is {shared[0]!r}).")
@@ -67,6 +68,13 @@ def open_splits(cfg: DictConfig) -> Splits:
 def fingerprint(scenes: SceneStore) -> str:
     """Digest of the scenes' ids in order: an index means nothing without it."""
     return hashlib.sha256("\n".join(scenes.scene_ids).encode()).hexdigest()[:16]
+
+
+def _chosen(scenes: SceneStore, select: DictConfig, split: str) -> SceneStore:
+    chosen = build(scenes.select, select, "scenes.select")
+    if not len(chosen):
+        raise ValueError(f"scenes.select={dict(select)} leaves none of the {len(scenes)} scenes of scenes.{split}.")
+    return chosen
 
 
 def _open(cfg: DictConfig, paths: str | ListConfig) -> SceneStore:

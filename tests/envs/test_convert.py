@@ -358,8 +358,15 @@ def test_real_files_convert(shared: Path, tmp_path: Path) -> None:
     assert store.num_agents.tolist() == [50, 84]  # SPEC section 1.2
     lights = convert("gpudrive", [shared / "scenes/gpudrive/lights"], tmp_path / "lights", limit=2)
     assert lights.scene_ids == ["238786b3cccc4a0e", "48b0814dee9301a0"]
-    for source in (store, lights):
+    argoverse = convert("argoverse", [shared / "scenes/argoverse2"], tmp_path / "argoverse")
+    assert len(argoverse) == 3
+    for source in (store, lights, argoverse):
         source.verify()
+    together = SceneStore(*(source.folders[0] for source in (store, lights, argoverse)))
+    assert len(together.select(complete_in=["sizes"])) == 4
+    assert together.select(source="argoverse").scene_ids == argoverse.scene_ids
+    size = sum((store.folders[0] / shard["name"]).stat().st_size for shard in store.manifests[0].shards)
+    assert size / len(store) < 110_000  # bytes; the protos have 975 KB
 
 
 if __name__ == "__main__":

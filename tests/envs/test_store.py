@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from envs.codec import decode, encode
-from envs.scene import Lacks, Lights, MapKind, Scene, SceneError, SceneSource, collate
+from envs.scene import Lights, MapKind, Scene, SceneError, SceneSource, collate
 from envs.shards import Shard
 from envs.sources.synthetic import build_scene, red_light, straight_road, two_cars_head_on
 from envs.store import SceneStore
@@ -145,8 +145,10 @@ def test_several_folders_are_one_store_and_can_be_told_apart(tmp_path: Path, wri
 def test_scenes_are_selected_by_what_they_hold(store: SceneStore) -> None:
     assert store.select(has_lights=True).scene_ids == ["red_light"]
     assert store.select(max_agents=2, has_lights=False).scene_ids == [two_cars_head_on().scene_id]
-    assert len(store.select(without=Lacks.TOPOLOGY)) == 0
-    assert len(store.select(without=Lacks.LIGHTS)) == 3
+    assert len(store.select(complete_in=["topology"])) == 0
+    assert len(store.select(complete_in=["lights"])) == 3
+    with pytest.raises(ValueError, match="nothing is called 'signals'; a recording may lack .*LIGHTS"):
+        store.select(complete_in=["signals"])
     assert len(store.select(min_agents=9)) == 0
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gzip
 import importlib.util
 import multiprocessing
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -29,17 +31,22 @@ from envs.scene import (
     polylines,
 )
 from envs.sources import sumo
-from envs.sources.sumo_map import GUTTER, NetMap, build_map
-from envs.sources.sumo_network import NetConnection, NetEdge, NetLane, Network, run_sumo, sumo_binary
-from envs.sources.sumo_scene import cut_map
-from envs.sources.sumo_tracks import make_tracks, smooth, trail
-from envs.sources.sumo_traffic import Recording
+from envs.sources.sumo.classes import CLASSES
+from envs.sources.sumo.cut import cut_map
+from envs.sources.sumo.demand import draw_types
+from envs.sources.sumo.makers import make_network
+from envs.sources.sumo.netmap import GUTTER, NetMap, build_map
+from envs.sources.sumo.network import NetConnection, NetEdge, NetLane, Network, read_network, run_sumo, sumo_binary
+from envs.sources.sumo.options import settings as sumo_settings
+from envs.sources.sumo.tracks import make_tracks, smooth, trail
+from envs.sources.sumo.traffic import Recording
 
 shapely = pytest.importorskip("shapely", reason="needs the extra `sumo`")
 pytest.importorskip("sumolib", reason="needs the extra `sumo`")
 
 LANE_WIDTH = 3.2
 SMALL = {"windows": 2, "warmup": 15.0, "scenes_per_unit": 8}
+KINDS = [name for name in sumo.presets() if name != "mixed"]
 
 
 # --- simulated scenes ------------------------------------------------------------------------------------------------
@@ -48,8 +55,7 @@ SMALL = {"windows": 2, "warmup": 15.0, "scenes_per_unit": 8}
 @pytest.fixture(scope="module")
 def scenes() -> list[Scene]:
     """Scenes of every kind of network."""
-    kinds = [name for name in sumo.presets() if name != "mixed"]
-    return [scene for kind in kinds for scene in sumo.generate(8, seed=11, preset=kind, **SMALL)]
+    return [scene for kind in KINDS for scene in sumo.generate(8, seed=11, preset=kind, **SMALL)]
 
 
 def boxes_of(scene: Scene) -> torch.Tensor:
@@ -59,22 +65,46 @@ def boxes_of(scene: Scene) -> torch.Tensor:
     return torch.cat((agents.position[..., :2], agents.heading[..., None], size), -1).transpose(0, 1)
 
 
-def vehicle_motion(scenes: list[Scene]) -> dict[str, torch.Tensor]:
-    """Speed, acceleration, yaw rate and the part of a step that speed does not explain, of all vehicle steps."""
-    rows: dict[str, list[torch.Tensor]] = {"speed": [], "acceleration": [], "yaw_rate": [], "jump": []}
+def motion(scenes: list[Scene], on_foot: bool = False) -> dict[str, torch.Tensor]:
+    """What bodies do at all steps: of vehicles and cyclists, or of pedestrians.
+
+    ``slide`` is the centre's velocity across the heading, ``jump`` the part of a step that no speed explains.
+    """
+    rows: dict[str, list[torch.Tensor]] = {}
     for scene in scenes:
         agents = scene.agents
-        cars = agents.kind == AgentKind.VEHICLE
-        valid = agents.valid[cars]
+        chosen = (agents.kind == AgentKind.PEDESTRIAN) == on_foot
+        valid, velocity, heading = agents.valid[chosen], agents.velocity[chosen], agents.heading[chosen]
         both = valid[:, 1:] & valid[:, :-1]
-        speed = agents.velocity[cars].norm(dim=-1)
-        turn = agents.heading[cars].diff(dim=1)
-        step = agents.position[cars].diff(dim=1).norm(dim=-1)
-        rows["speed"].append(speed[valid])
-        rows["acceleration"].append((speed.diff(dim=1) / STEP_SECONDS)[both])
-        rows["yaw_rate"].append((torch.atan2(turn.sin(), turn.cos()) / STEP_SECONDS)[both])
-        rows["jump"].append((step - speed[:, 1:] * STEP_SECONDS)[both])
+        speed, turn = velocity.norm(dim=-1), heading.diff(dim=1)
+        slide = velocity[..., 1] * heading.cos() - velocity[..., 0] * heading.sin()
+        step = agents.position[chosen].diff(dim=1).norm(dim=-1)
+        values = {
+            "speed": speed[valid],
+            "limit": speed.new_tensor([float(scene.road.speed_limit.max())]).expand(int(valid.sum())),
+            "acceleration": (speed.diff(dim=1) / STEP_SECONDS)[both],
+            "yaw_rate": (torch.atan2(turn.sin(), turn.cos()) / STEP_SECONDS)[both],
+            "slide": slide[valid],
+            "slide_rate": (slide.diff(dim=1) / STEP_SECONDS)[both],
+            "jump": (step - torch.maximum(speed[:, 1:], speed[:, :-1]) * STEP_SECONDS)[both],
+        }
+        for name, value in values.items():
+            rows.setdefault(name, []).append(value)
     return {name: torch.cat(values) for name, values in rows.items()}
+
+
+def check_motion(scenes: list[Scene]) -> None:
+    """Nobody teleports, and wheels roll forward."""
+    wheels, feet = motion(scenes), motion(scenes, on_foot=True)
+    for told in (wheels, feet):
+        assert told["jump"].numel() == 0 or told["jump"].max() < 0.05
+    assert (wheels["speed"] < 1.3 * wheels["limit"]).all()
+    assert feet["speed"].numel() == 0 or feet["speed"].max() < 4
+    assert wheels["acceleration"].abs().max() < 10 and wheels["acceleration"].abs().quantile(0.999) < 6
+    assert wheels["yaw_rate"].abs().max() < 4 and wheels["yaw_rate"].abs().quantile(0.999) < 1.5
+    # the centre of a box lies ahead of its rear axle, so in a turn it moves sideways a little
+    assert wheels["slide"].abs().max() < 3.5
+    assert wheels["slide_rate"].abs().max() < 10 and wheels["slide_rate"].abs().quantile(0.999) < 4
 
 
 def test_a_scene_is_a_window_around_a_moving_car(scenes: list[Scene]) -> None:
@@ -102,7 +132,7 @@ def test_agents_to_predict_stay_to_the_end_and_are_of_several_kinds(scenes: list
 
 
 def test_scene_ids_are_unique(scenes: list[Scene]) -> None:
-    assert len({scene.scene_id for scene in scenes}) == len(scenes) == 32
+    assert len({scene.scene_id for scene in scenes}) == len(scenes) == 48
 
 
 def test_maps_are_small_and_whole(scenes: list[Scene]) -> None:
@@ -147,12 +177,22 @@ def test_no_vehicle_or_cyclist_collides(scenes: list[Scene]) -> None:
         assert gap.min() >= 0
 
 
-def test_vehicles_move_within_physical_limits(scenes: list[Scene]) -> None:
-    motion = vehicle_motion(scenes)
-    assert motion["speed"].max() < 30 and (motion["speed"] < 0.1).float().mean() < 0.7
-    assert motion["acceleration"].abs().max() < 8
-    assert motion["yaw_rate"].abs().quantile(0.999) < 1.5
-    assert motion["jump"].max() < 0.5
+@pytest.mark.parametrize("kind", KINDS)
+def test_bodies_move_without_jumps_and_hardly_sideways(kind: str, scenes: list[Scene]) -> None:
+    check_motion([scene for scene in scenes if scene.scene_id.startswith(f"sumo_{kind}_")])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_bodies_move_so_in_many_networks(kind: str) -> None:
+    check_motion(list(sumo.generate(60, seed=12, preset=kind)))
+
+
+def test_traffic_flows(scenes: list[Scene]) -> None:
+    for kind in KINDS:
+        speed = motion([scene for scene in scenes if scene.scene_id.startswith(f"sumo_{kind}_")])["speed"]
+        assert (speed < 0.1).float().mean() < (0.1 if kind == "motorway" else 0.7)
+        assert speed.max() > (20 if kind == "motorway" else 7)
 
 
 def test_vehicles_face_where_they_go(scenes: list[Scene]) -> None:
@@ -257,7 +297,17 @@ def test_the_source_gives_what_a_unit_gives() -> None:
     [
         ({"preset": "village"}, "no preset 'village'.*arterial"),
         ({"split": "eval"}, "no split 'eval'.*test"),
-        ({"rdius": 5.0}, "no option 'rdius'.*radius"),
+        ({"rdius": 5.0}, "no option 'rdius'.*preset.*radius.*density"),
+        ({"density": "dense"}, "density takes a number, got 'dense'"),
+        ({"trucks": 2}, "trucks is a share of the vehicles, 0 to 1, got 2"),
+        ({"imperfection": -1}, "imperfection must not be negative, got -1"),
+        ({"radius": float("nan")}, "radius takes a number, got nan"),
+        ({"max_agents": 3.5}, "max_agents takes an integer, got 3.5"),
+        ({"seed": "x"}, "seed must lie in 0 ... 9999 .an integer., got 'x'"),
+        ({"net": "a.net.xml", "preset": "grid"}, "net=a.net.xml brings a network of its own; leave preset=grid out"),
+        ({"routes": "a.rou.xml"}, "routes=a.rou.xml needs the network"),
+        ({"net": "a,b.net.xml"}, "'a,b.net.xml' holds a comma"),
+        ({"net": "a", "routes": "b", "trucks": 0.1}, "trucks changes random traffic, and routes=b brings its own"),
         ({"radius": -5.0}, "radius must be positive, got -5.0"),
         ({"window_spacing": 3.0}, "window_spacing must be at least 9.1 s, got 3.0"),
         ({"seed": 10_000}, "seed must lie in 0 ... 9999, got 10000"),
@@ -292,6 +342,242 @@ def test_a_failure_of_sumo_is_told() -> None:
     with pytest.raises(RuntimeError, match="(?s)netgenerate failed.*No option with the name 'no-such-option'"):
         run_sumo("netgenerate", {"no-such-option": 1})
     assert Path(sumo_binary("sumo")).exists()
+
+
+# --- traffic that a request changes -----------------------------------------------------------------------------------
+
+
+def agents_of(**request: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Kinds and lengths of all agents of a small unit."""
+    words = {"preset": "town", "windows": 2, "warmup": 10.0, "scenes_per_unit": 4, "min_agents": 1} | request
+    scenes = list(sumo.generate(4, seed=6, **words))
+    kinds, lengths = (
+        torch.cat([get(s.agents) for s in scenes]) for get in (lambda a: a.kind, lambda a: a.extent[:, 0])
+    )
+    return kinds, lengths
+
+
+def test_density_changes_how_many_vehicles_there_are() -> None:
+    sparse, dense = (int((agents_of(density=d, max_agents=100)[0] == AgentKind.VEHICLE).sum()) for d in (0.3, 1.5))
+    assert dense > 2 * sparse > 0
+
+
+def test_shares_of_trucks_cyclists_and_pedestrians_are_what_was_asked_for() -> None:
+    kinds, lengths = agents_of(trucks=0, cyclists=0, pedestrians=0)
+    assert (kinds == AgentKind.VEHICLE).all() and lengths.max() < 6
+    kinds, lengths = agents_of(trucks=0.5, pedestrians=40)
+    vehicle = kinds == AgentKind.VEHICLE
+    assert (lengths[vehicle] > 6).float().mean() > 0.25 and (~vehicle).sum() > 10
+
+
+@pytest.mark.parametrize(("factor", "lowest", "highest"), [(0.0, 0.0, 0.0), (1.0, 0.1, 0.5), (3.0, 0.3, 1.0)])
+def test_imperfection_multiplies_the_errors_of_drivers(factor: float, lowest: float, highest: float) -> None:
+    types = draw_types({"car": {"impatience": 0.2}}, factor, np.random.default_rng(0))
+    sigma = [attributes["sigma"] for attributes in types.values() if "sigma" in attributes]
+    assert lowest <= min(sigma) and max(sigma) <= highest and (factor < 2 or max(sigma) == 1)
+    assert types["car0"]["impatience"] == pytest.approx(0.2 * factor)
+
+
+# --- motorways and roundabouts ----------------------------------------------------------------------------------------
+
+
+def drawn_network(kind: str, seed: int, folder: Path) -> Network:
+    preset = sumo_settings()["presets"][kind]
+    return make_network(folder, preset["network"], preset["signalled"], seed)
+
+
+def near_street(network: Network, *edges: str) -> np.ndarray:
+    """Points of the left borders of streets."""
+    lanes = [network.edges[edge].lanes[-1] for edge in edges]
+    return np.concatenate([np.asarray(shapely.LineString(s.shape).offset_curve(s.width / 2).coords) for s in lanes])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_motorway_has_a_median_and_ramps(seed: int, tmp_path: Path) -> None:
+    network = drawn_network("motorway", seed, tmp_path)
+    area = build_map(network, 5.0).drivable
+    assert len(area.geoms) == 2, "the carriageways do not touch"
+    names = sorted(network.edges)
+    assert {"east_on", "east_off", "west_on", "west_off"} <= set(names)
+    for name in names:
+        lanes = network.edges[name].lanes
+        assert all(lane.use == "vehicle" for lane in lanes)
+        assert 16 <= lanes[0].speed <= 36 and (len(lanes) == 1) == name.endswith(("_on", "_off"))
+    exits = network.ways_out()
+    assert set(exits["east_on"]) == set(exits["east_0"]) - ({"east_off"} if "east_4" in names else set())
+    median = near_street(network, *[n for n in names if n[5:].isdigit()])[10:-10]
+    around = shapely.buffer(shapely.points(median), 1.0)
+    assert not shapely.contains(area, around).any(), "the median is not drivable"
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_roundabout_has_an_island_and_lets_everybody_out_everywhere(seed: int, tmp_path: Path) -> None:
+    network = drawn_network("roundabout", seed, tmp_path)
+    area = build_map(network, 5.0).drivable
+    assert area.geom_type == "Polygon"
+    rings = [e for e in network.edges if e.endswith("_on")]
+    circles = {name[0] for name in rings}
+    assert len(area.interiors) == len(circles)
+    for circle in circles:
+        ring = np.concatenate([network.edges[e].lanes[-1].shape for e in rings if e[0] == circle])
+        holes = [shapely.Polygon(hole) for hole in area.interiors]
+        assert sum(hole.contains(shapely.Point((ring.min(0) + ring.max(0)) / 2)) for hole in holes) == 1
+    arms = {edge for edge in network.edges if edge.endswith("_depart")}
+    assert all(set(network.ways_out()[e]) == arms for e in rings)
+    assert min(hole.area for hole in map(shapely.Polygon, area.interiors)) > 400
+
+
+# --- networks of one's own --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small network with pavements, whose streets end."""
+    path = tmp_path_factory.mktemp("own") / "my town.net.xml"
+    options = {"grid": True, "grid.number": 2, "grid.length": 90, "grid.attach-length": 80, "output-file": path}
+    run_sumo("netgenerate", options | {"sidewalks.guess": True, "crossings.guess": True, "no-turnarounds": True})
+    return path
+
+
+ROUTES = """<routes>
+<vType id="long" vClass="bus" length="14.5"/>
+<vTypeDistribution id="two"><vType id="small" vClass="motorcycle" probability="1"/></vTypeDistribution>
+<vType id="walker" vClass="pedestrian" width="0.6"/>
+<flow id="p" begin="0" end="30" period="2" from="left0A0" to="B1right1"/>
+<flow id="q" begin="0" end="30" period="3" from="right1B1" to="A0left0"/>
+<vehicle id="late" type="long" depart="0:00:06"><route edges="left1A1 A1B1 B1right1"/></vehicle>
+<vehicle id="early" type="two" depart="4"><route edges="left0A0 A0B0 B0right0"/></vehicle>
+<trip id="t" type="DEFAULT_BIKETYPE" depart="1" from="left0A0" to="B0right0"/>
+<person id="w" type="walker" depart="0"><walk from="left0A0" to="A0B0"/></person>
+</routes>"""
+OWN = {"windows": 1, "warmup": 12.0, "scenes_per_unit": 2, "min_agents": 2, "radius": 200.0}
+
+
+@pytest.fixture
+def routes(tmp_path: Path) -> Path:
+    path = tmp_path / "all.rou.xml"
+    path.write_text(ROUTES)
+    return path
+
+
+def test_random_traffic_on_a_network_of_ones_own(town: Path) -> None:
+    request = f"net={town},num_scenes=4,seed=2,windows=1,warmup=5,scenes_per_unit=2"
+    texts = sumo.SUMO.find([request])
+    assert len(texts) == 2
+    first, second = ([*sumo.SUMO.scenes(text)] for text in texts)
+    assert [s.scene_id.rsplit("_", 2)[0] for s in first + second] == ["sumo_my-town_20000"] * 2 + [
+        "sumo_my-town_20001"
+    ] * 2
+    assert all(same(a, b) for a, b in zip(first, sumo.SUMO.scenes(texts[0]), strict=True))
+    assert {int(k) for s in first + second for k in s.agents.kind} >= {AgentKind.VEHICLE, AgentKind.PEDESTRIAN}
+    check_motion(first + second)
+
+
+def test_routes_of_ones_own_say_who_drives(town: Path, routes: Path) -> None:
+    scenes = list(sumo.generate(2, net=str(town), routes=str(routes), **OWN))
+    agents = scenes[0].agents
+    seen = {
+        (int(k), round(float(e[0]), 3)) for s in scenes for k, e in zip(s.agents.kind, s.agents.extent, strict=True)
+    }
+    assert {(AgentKind.VEHICLE, 14.5), (AgentKind.VEHICLE, 5.0)} <= seen
+    sizes = {round(CLASSES[name].extent[0], 3) for name in ("passenger", "motorcycle", "bicycle", "pedestrian")} | {
+        14.5
+    }
+    assert {length for _, length in seen} <= sizes and (AgentKind.VEHICLE, 1.6) not in seen
+    assert float(agents.extent[0, 0]) == 5.0, "the SDC is a car"
+
+
+def test_density_scales_routes_of_ones_own(town: Path, routes: Path) -> None:
+    words = {"net": str(town), "routes": str(routes), "max_agents": 100} | OWN
+    once, twice = (len(next(sumo.generate(1, density=d, **words)).agents.kind) for d in (1.0, 2.0))
+    assert twice > 1.3 * once
+
+
+def test_packed_files_give_the_same_scenes(town: Path, routes: Path, tmp_path: Path) -> None:
+    packed = []
+    for path in (town, routes):
+        packed.append(tmp_path / f"{path.name}.gz")
+        packed[-1].write_bytes(gzip.compress(path.read_bytes()))
+    plain, unpacked = (
+        list(sumo.generate(1, net=str(net), routes=str(way), **OWN)) for net, way in ((town, routes), packed)
+    )
+    assert all(same(a, b) for a, b in zip(plain, unpacked, strict=True))
+
+
+def test_a_network_without_dead_ends_is_filled_from_its_streets(tmp_path: Path) -> None:
+    path = tmp_path / "ring.net.xml"
+    run_sumo("netgenerate", {"grid": True, "grid.number": 3, "grid.length": 90, "output-file": path})
+    assert not read_network(path).dead_ends
+    assert len(list(sumo.generate(2, net=str(path), windows=1, warmup=5.0))) == 2
+
+
+def test_lanes_for_rails_are_no_road(town: Path, tmp_path: Path) -> None:
+    tree = ElementTree.parse(town)
+    lane = tree.getroot().find("edge/lane[@id='A0A1_1']")
+    lane.attrib.pop("disallow", None)
+    lane.set("allow", "tram rail")
+    tree.write(tmp_path / "rails.net.xml")
+    network, rails = read_network(town), read_network(tmp_path / "rails.net.xml")
+    assert set(network.lanes) - set(rails.lanes) == {"A0A1_1"} and not rails.edges["A0A1"].lanes_for("vehicle")
+    build_map(rails, 5.0)
+
+
+LAUGHS = '<!DOCTYPE net [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;">]><net>&b;</net>'
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "cannot be read as a SUMO network.*No such file"),
+        (b"<net><edge", "cannot be read as a SUMO network.*give a file that SUMO wrote"),
+        (b"<routes/>", "holds <routes>, not a SUMO network"),
+        (b"<net/>", "no street where cars may drive"),
+        (b"<net><edge id='a' from='x' to='y'><lane id='a_0' index='0'/></edge></net>", "no complete SUMO network"),
+        (LAUGHS.encode(), "has a <!DOCTYPE>"),
+        (LAUGHS.encode("utf-16"), "has a <!DOCTYPE>"),
+        (b"\x80\x04K\x01.", "cannot be read as a SUMO network"),
+    ],
+)
+def test_a_bad_network_is_named_before_anything_is_simulated(
+    content: bytes | None, message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "bad.net.xml"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(SceneError, match=f"(?s)bad.net.xml.*{message}"):
+        sumo.SUMO.find([f"net={path},num_scenes=2"])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("<routes>", LAUGHS[: LAUGHS.index("<net>")] + "<routes>", "has a <!DOCTYPE>"),
+        ('length="14.5"', 'length="long"', "type 'long' has a size that is no number"),
+        (ROUTES, "<routes/>", "nobody departs"),
+        (ROUTES, "no xml", "cannot be read as a route file"),
+    ],
+)
+def test_bad_routes_are_named_before_anything_is_simulated(
+    old: str, new: str, message: str, town: Path, routes: Path
+) -> None:
+    routes.write_text(ROUTES.replace(old, new))
+    with pytest.raises(SceneError, match=f"(?s)all.rou.xml.*{message}"):
+        sumo.SUMO.find([f"net={town},routes={routes},num_scenes=2"])
+
+
+def test_what_sumo_says_about_routes_is_told(town: Path, routes: Path) -> None:
+    routes.write_text(ROUTES.replace("left1A1", "nowhere"))
+    with pytest.raises(SceneError, match="(?s)all.rou.xml: SUMO cannot simulate it.*nowhere"):
+        next(sumo.generate(1, net=str(town), routes=str(routes), **OWN))
+
+
+def test_a_type_from_another_file_must_be_written_down(town: Path, routes: Path) -> None:
+    (routes.parent / "types.xml").write_text('<routes><vType id="strange" vClass="taxi"/></routes>')
+    routes.write_text(
+        ROUTES.replace("<routes>", '<routes><include href="types.xml"/>').replace('"two" depart', '"strange" depart')
+    )
+    with pytest.raises(SceneError, match="all.rou.xml: somebody is of type 'strange'; write its <vType>"):
+        next(sumo.generate(1, net=str(town), routes=str(routes), **OWN))
 
 
 # --- a map worked out by hand ----------------------------------------------------------------------------------------

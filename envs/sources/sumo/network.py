@@ -1,4 +1,4 @@
-"""Random road networks from SUMO's ``netgenerate``, read back as plain records.
+"""Road networks of SUMO, read as plain records.
 
 Only the facts that a map and its traffic need are read: streets, lanes and connections.
 """
@@ -15,19 +15,14 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from envs.scene import SceneError
+from envs.sources.sumo.xml import read_xml
+
 LaneUse = Literal["vehicle", "bike", "foot"]
 LaneRole = Literal["street", "internal", "crossing", "walkingarea"]
 
-NETGENERATE_RULES = {
-    # nobody turns round in the middle of a road; a street that ends is an end of the world
-    "no-turnarounds": True,
-    # the corner of a kerb and the shape of a turn: wide and fine enough for a truck and for a smooth heading
-    "default.junctions.radius": 6,
-    "junctions.internal-link-detail": 8,
-    "default.bikelane-width": 1.5,
-    "precision": 3,
-}
-"""What every network has in common."""
+MOTOR_CLASSES = ("passenger", "taxi", "bus", "coach", "delivery", "truck", "trailer", "emergency", "motorcycle")
+"""Who makes a lane one for vehicles, if admitted."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +114,14 @@ class Network:
         return sorted({c.light for c in self.connections if c.light})
 
     def ways_out(self) -> dict[str, list[str]]:
-        """For each street, those that end in a dead end and can be driven to from it (it may be one itself)."""
+        """For each street, those that end in a dead end and can be driven to from it (it may be one itself).
+
+        In a network without dead ends, all that can be driven to.
+        """
+        return self._ways_out
+
+    @cached_property
+    def _ways_out(self) -> dict[str, list[str]]:
         onward: dict[str, set[str]] = {edge: set() for edge in self.edges}
         for connection in self.connections:
             if self.lanes[connection.source].use == "vehicle":
@@ -132,14 +134,14 @@ class Network:
             new = onward[waiting.pop()] - reached
             reached |= new
             waiting += sorted(new)
-        return sorted(name for name in reached if self.edges[name].end in self.dead_ends)
+        return sorted(name for name in reached if self.edges[name].end in self.dead_ends or not self.dead_ends)
 
 
 def sumo_binary(name: str) -> str:
     """Path of a SUMO program.
 
     Args:
-        name: ``"sumo"`` or ``"netgenerate"``.
+        name: ``"sumo"``, ``"netgenerate"`` or ``"netconvert"``.
 
     Raises:
         ImportError: SUMO is not installed; the message names the extra.
@@ -165,61 +167,30 @@ def run_sumo(name: str, options: dict[str, object]) -> None:
         raise RuntimeError(f"{name} failed with status {done.returncode}: {done.stderr.strip()[-800:]}")
 
 
-def draw_options(ranges: dict[str, object], rng: np.random.Generator) -> dict[str, object]:
-    """Draw a value for every option that is a pair ``[low, high]``; integers if both are.
-
-    Examples:
-        >>> draw_options({"rand": True, "lanes": [2, 2], "speed": [8.0, 8.0]}, np.random.default_rng(0))
-        {'rand': True, 'lanes': 2, 'speed': 8.0}
-    """
-
-    def draw(value: object) -> object:
-        if not isinstance(value, list | tuple):
-            return value
-        low, high = value
-        if isinstance(low, int) and isinstance(high, int):
-            return int(rng.integers(low, high + 1))
-        return round(float(rng.uniform(low, high)), 3)
-
-    return {name: draw(value) for name, value in ranges.items()}
-
-
-def make_network(folder: Path, rules: dict[str, object], signalled: float, seed: int) -> Network:
-    """Generate one network.
-
-    Args:
-        folder: where ``net.xml`` is written.
-        rules: options of ``netgenerate`` (without the dashes); pairs are drawn, see :func:`draw_options`.
-        signalled: share of the junctions that get a traffic light; 1 leaves the choice to ``rules``.
-        seed: of the network.
+def read_network(path: Path) -> Network:
+    """Read a SUMO network file (``.net.xml``, also ``.gz``); lanes for neither wheels nor feet (rails) are left out.
 
     Raises:
-        ImportError: SUMO is not installed.
-        RuntimeError: ``netgenerate`` refused the options.
+        SceneError: no such file, or no network in it.
     """
-    rng = np.random.default_rng(seed)
-    options = NETGENERATE_RULES | draw_options(rules, rng) | {"seed": seed, "output-file": folder / "net.xml"}
-    run_sumo("netgenerate", options)
-    network = read_network(folder / "net.xml")
-    if signalled < 1:
-        crossroads = sorted({edge.end for edge in network.edges.values()} - network.dead_ends)
-        chosen = [node for node in crossroads if rng.random() < signalled]
-        if chosen:
-            run_sumo("netgenerate", options | {"tls.set": ",".join(chosen)})
-            network = read_network(folder / "net.xml")
-    return network
+    root = read_xml(path, "a SUMO network (.net.xml)")
+    if root.tag != "net":
+        raise SceneError(f"{path}: holds <{root.tag}>, not a SUMO network; give the .net.xml that netconvert writes.")
+    try:
+        return _read_records(path, root)
+    except (KeyError, TypeError, ValueError) as error:
+        raise SceneError(f"{path}: is no complete SUMO network ({error!r}); build it again with netconvert.") from error
 
 
-def read_network(path: Path) -> Network:
-    """Read a SUMO network file (``.net.xml``)."""
-    root = ElementTree.parse(path).getroot()
+def _read_records(path: Path, root: ElementTree.Element) -> Network:
     lanes: dict[str, NetLane] = {}
     edges: dict[str, NetEdge] = {}
     for element in root.iterfind("edge"):
         role = element.get("function", "street")
-        own = tuple(_read_lane(lane, element.get("id"), role) for lane in element.iterfind("lane"))
+        read = (_read_lane(lane, element.get("id"), role) for lane in element.iterfind("lane"))
+        own = tuple(lane for lane in read if lane is not None)
         lanes |= {lane.lane_id: lane for lane in own}
-        if role == "street":
+        if role == "street" and own:
             edges[element.get("id")] = NetEdge(element.get("id"), element.get("from"), element.get("to"), own)
     return Network(
         path=path,
@@ -235,22 +206,41 @@ def _read_shape(text: str) -> np.ndarray:
     return np.array([[float(v) for v in point.split(",")[:2]] for point in text.split()])
 
 
-def _read_lane(element: ElementTree.Element, edge_id: str, role: LaneRole) -> NetLane:
+def _read_use(element: ElementTree.Element) -> LaneUse | None:
+    """Who may be on a lane; nothing for rails, ships and the like."""
     allow, disallow = element.get("allow"), element.get("disallow", "").split()
 
     def admits(vehicle_class: str) -> bool:
-        return vehicle_class in allow.split() if allow is not None else vehicle_class not in disallow
+        if allow is not None:
+            return vehicle_class in allow.split() or allow == "all"
+        return vehicle_class not in disallow and disallow != ["all"]
 
+    if any(map(admits, MOTOR_CLASSES)):
+        return "vehicle"
+    return "bike" if admits("bicycle") else "foot" if admits("pedestrian") else None
+
+
+def _read_lane(element: ElementTree.Element, edge_id: str, role: LaneRole) -> NetLane | None:
+    use = _read_use(element)
+    if use is None:
+        return None
     return NetLane(
         lane_id=element.get("id"),
         edge_id=edge_id,
         index=int(element.get("index")),
-        use="vehicle" if admits("passenger") else "bike" if admits("bicycle") else "foot",
+        use=use,
         role=role,
         width=float(element.get("width", 3.2)),  # SUMO leaves its default width out of the file
         speed=float(element.get("speed")),
         shape=_read_shape(element.get("shape")),
     )
+
+
+def _is_drivable(source: NetLane | None, target: NetLane | None, via: NetLane | None) -> bool:
+    """A connection between two lanes on which one can drive, through a lane inside the junction."""
+    if source is None or target is None or via is None:
+        return False
+    return source.role == target.role == "street" and "foot" not in (source.use, target.use)
 
 
 def _read_connections(root: ElementTree.Element, lanes: dict[str, NetLane]) -> list[NetConnection]:
@@ -259,10 +249,10 @@ def _read_connections(root: ElementTree.Element, lanes: dict[str, NetLane]) -> l
     connections = []
     for e in elements:
         source, target = f"{e.get('from')}_{e.get('fromLane')}", f"{e.get('to')}_{e.get('toLane')}"
-        if lanes[source].role != "street" or lanes[source].use == "foot" or e.get("via") is None:
+        if not _is_drivable(lanes.get(source), lanes.get(target), lanes.get(e.get("via"))):
             continue
         via = [e.get("via")]
-        while onward[via[-1]] is not None:
+        while onward.get(via[-1]) is not None:
             via.append(onward[via[-1]])
         connections.append(
             NetConnection(

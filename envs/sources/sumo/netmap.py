@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from envs.scene import LinkKind, MapKind
-from envs.sources.sumo_network import NetConnection, NetLane, Network
+from envs.sources.sumo.network import NetConnection, NetLane, Network
 
 FREEWAY_SPEED = 22.0
 """A lane with at least this limit is a freeway lane [m/s] (about 80 km/h)."""
@@ -23,9 +23,13 @@ GUTTER = 0.3
 """Paved strip between a lane's border and the kerb [m]."""
 SIMPLIFY = 0.05
 """How far a simplified line may lie from the exact one [m]."""
+MEDIAN_LENGTH = 30.0
+"""What rounding fills between lanes is a median or the gore of a ramp, no kerb, if it is longer than this [m]."""
+PAINTED_GAP = 2.6
+"""A gap between lanes narrower than this is paint on one road (a turning strip, the tip of a gore), no median [m]."""
 ISLAND_AREA = 150.0
-"""A hole of the drivable area below this size is the middle of a junction that no lane crosses, not a block [m^2]."""
-
+"""A hole of the drivable area below this size is the middle of a junction that no lane crosses, or a splitter island,
+not a block, a median or the middle of a roundabout [m^2]."""
 
 SAME_LINE = 0.5
 """Two border lines closer than this are one painted line [m]."""
@@ -118,13 +122,32 @@ def drivable_area(network: Network) -> object:
     # square ends reach past a dead end, where bumpers arrive, and into the junction elsewhere
     strips = [shapely.LineString(lane.shape).buffer(lane.width / 2 + GUTTER, cap_style="square") for lane in lanes]
     # Closing (grow, then shrink) rounds the kerbs and heals gaps between lanes; opening by a little cuts off spikes.
-    area = shapely.union_all(strips).buffer(KERB_RADIUS).buffer(-KERB_RADIUS - 0.2).buffer(0.2)
+    paved = shapely.union_all(strips)
+    area = _keep_medians(paved.buffer(KERB_RADIUS).buffer(-KERB_RADIUS - 0.2).buffer(0.2), paved)
     parts = [part for part in getattr(area, "geoms", [area]) if part.area > ISLAND_AREA]
     solid = [
         shapely.Polygon(part.exterior, [hole for hole in part.interiors if shapely.Polygon(hole).area > ISLAND_AREA])
         for part in parts
     ]
     return shapely.union_all(solid).simplify(SIMPLIFY)
+
+
+def _keep_medians(rounded: object, paved: object) -> object:
+    """Take back what rounding filled between two carriageways, or between a motorway and its ramp.
+
+    Args:
+        rounded: the drivable area with rounded kerbs.
+        paved: the union of the lanes.
+    """
+    import shapely
+
+    painted = paved.buffer(PAINTED_GAP / 2).buffer(-PAINTED_GAP / 2)
+    filled = rounded.difference(painted).buffer(-0.2)  # without the slivers along every border
+    medians = [p for p in shapely.get_parts(filled) if p.length / 2 > MEDIAN_LENGTH]
+    if not medians:
+        return rounded
+    taken = shapely.buffer(shapely.union_all(medians), 0.3).difference(painted)
+    return rounded.difference(taken).buffer(-0.2).buffer(0.2)
 
 
 def _rings(drivable: object) -> list[np.ndarray]:
@@ -174,23 +197,34 @@ def _lane_drafts(network: Network) -> list[Draft]:
 
 def _line_drafts(network: Network, drivable: object) -> list[Draft]:
     """Lines between the lanes of a street, and to the left of each of its two directions (once where they coincide)."""
-    import shapely
-
-    drafts, middle = [], []
-    for edge in network.edges.values():
-        lanes = [lane for lane in edge.lanes if lane.use != "foot"]
+    drafts = []
+    driven = {edge.edge_id: [lane for lane in edge.lanes if lane.use != "foot"] for edge in network.edges.values()}
+    driven = {edge_id: lanes for edge_id, lanes in driven.items() if lanes}
+    middle = _middle_lines({edge_id: _left_side(lanes[-1]) for edge_id, lanes in driven.items()}, drivable)
+    for edge_id, lanes in driven.items():
         for right, left in pairwise(lanes):
             kind = MapKind.LINE_BROKEN_WHITE if right.use == left.use else MapKind.LINE_SOLID_WHITE
             drafts.append((f"{right.lane_id}|", kind, _left_side(right), 0.0))
-        border = shapely.LineString(_left_side(lanes[-1]))
-        centre = border.interpolate(0.5, normalized=True)
-        inside = drivable.contains(centre.buffer(SAME_LINE))  # a one-way street has its road edge there
-        if inside and all(line.distance(centre) > SAME_LINE for line in middle):
-            wide = len(edge.lanes_for("vehicle")) > 1
+        if edge_id in middle:
+            wide = len(network.edges[edge_id].lanes_for("vehicle")) > 1
             kind = MapKind.LINE_SOLID_DOUBLE_YELLOW if wide else MapKind.LINE_BROKEN_YELLOW
-            drafts.append((f"{edge.edge_id}||", kind, np.asarray(border.coords), 0.0))
-            middle.append(border)
+            drafts.append((f"{edge_id}||", kind, middle[edge_id], 0.0))
     return drafts
+
+
+def _middle_lines(borders: dict[str, np.ndarray], drivable: object) -> dict[str, np.ndarray]:
+    """The left borders of streets that are painted: not those at a road edge, and only one where two coincide."""
+    import shapely
+
+    lines = [shapely.LineString(border) for border in borders.values()]
+    centres = shapely.line_interpolate_point(lines, 0.5, normalized=True)
+    shapely.prepare(drivable)
+    inside = shapely.contains(drivable, shapely.buffer(centres, SAME_LINE))  # a one-way street has its road edge there
+    tree, painted = shapely.STRtree(lines), set()
+    for i in np.flatnonzero(inside).tolist():
+        if painted.isdisjoint(tree.query(centres[i], predicate="dwithin", distance=SAME_LINE).tolist()):
+            painted.add(i)
+    return {edge_id: border for i, (edge_id, border) in enumerate(borders.items()) if i in painted}
 
 
 def _left_side(lane: NetLane) -> np.ndarray:

@@ -23,8 +23,8 @@ from envs.scene import (
     RoadMap,
     Scene,
 )
-from envs.sources.sumo_map import Feature, NetMap
-from envs.sources.sumo_tracks import Tracks
+from envs.sources.sumo.netmap import Feature, NetMap
+from envs.sources.sumo.tracks import Tracks
 
 SDC_TRAVEL = 5.0
 """An SDC moves at least this far in its scene [m]."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from envs.scene import STEP_SECONDS, AgentKind
-from envs.sources.sumo_traffic import Recording
+from envs.sources.sumo.traffic import Recording
 
 SMOOTHING_STEPS = 2.0
 """Standard deviation of the Gaussian that smooths a centre in time [steps of 0.1 s]."""
