@@ -91,20 +91,18 @@ class LogReader:
     def __call__(self, scene: Scene, generator: torch.Generator) -> Item:
         """The item of one scene."""
         context = make_context(self.augment(scene, generator), self.options)
-        item = log_item(context, self.tokenizer, noise=self.noise, generator=generator)
-        return crop_agents(item, self.max_agents, generator)
+        context = crop_agents(context, self.max_agents, generator)
+        return log_item(context, self.tokenizer, noise=self.noise, generator=generator)
 
 
-def crop_agents(item: Item, limit: int, generator: torch.Generator) -> Item:
+def crop_agents(context: SceneContext, limit: int, generator: torch.Generator) -> SceneContext:
     """Keep the ``limit`` agents nearest to a random one, to bound the cost of a crowded scene."""
-    count = len(item.context.kind)
+    count = len(context.kind)
     if count <= limit:
-        return item
-    xy = item.context.recent[:, -1, :2]
+        return context
+    xy = context.recent[:, -1, :2]
     centre = xy[torch.randint(count, (), generator=generator)]
-    near = (xy - centre).norm(dim=-1).argsort(stable=True)[:limit].sort().values
-    labels = None if item.labels is None else item.labels[:, near]
-    return Item(keep_agents(item.context, near), item.tokens[:, near], item.token_valid[near], labels)
+    return keep_agents(context, (xy - centre).norm(dim=-1).argsort(stable=True)[:limit].sort().values)
 
 
 def collate_items(items: Sequence[Item]) -> TensorDict:

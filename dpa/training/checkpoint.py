@@ -38,7 +38,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from dpa.training.options import differences
+from envs.options import differences
 
 FORMAT = "dpa-omf/1"
 """First entry of every file; the number changes when old files can no longer be read."""

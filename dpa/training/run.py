@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from dpa.training.checkpoint import Checkpointer, Stateful, capture, restore
 from dpa.training.loggers import Backend, make_logger
-from dpa.training.options import differences
+from envs.options import differences
 from envs.progress import progress
 
 

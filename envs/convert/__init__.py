@@ -22,6 +22,7 @@ from pathlib import Path
 from envs.convert.describe import write_card
 from envs.convert.plan import Task, digest, make_plan
 from envs.convert.work import make_shards
+from envs.options import differences
 from envs.progress import progress
 from envs.scene import SceneError
 from envs.shards import PARTIAL_PREFIX, ShardRecord, file_digest, read_record
@@ -117,12 +118,9 @@ def _resume(out: Path, manifest: Manifest) -> bool:
             raise SceneError(f"{out}: holds {foreign[0]!r} and no store; give a new or empty folder.")
         write_manifest(out, manifest)
     before = read_manifest(out)
-    for name in ("source", "options", "plan"):
-        if getattr(before, name) != getattr(manifest, name):
-            raise SceneError(
-                f"{out}: holds a conversion with another {name} ({getattr(before, name)}, now "
-                f"{getattr(manifest, name)}); give another folder, or remove this one."
-            )
+    there, here = ({"source": each.source, **each.options, "plan": each.plan} for each in (before, manifest))
+    if differ := differences(there, here):
+        raise SceneError(f"{out}: holds another conversion ({differ}); give another folder, or remove this one.")
     for leftover in out.glob(f"{PARTIAL_PREFIX}*"):
         leftover.unlink()
     return before.complete

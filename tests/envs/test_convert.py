@@ -104,7 +104,7 @@ def test_a_changed_input_is_another_plan(raw: Path, tmp_path: Path) -> None:
     convert("womd", [raw], tmp_path / "out")
     with (raw / "a.tfrecord").open("ab") as file:
         file.write(b"more")
-    with pytest.raises(SceneError, match="another plan"):
+    with pytest.raises(SceneError, match="another conversion .'plan'"):
         convert("womd", [raw], tmp_path / "out")
 
 
@@ -142,9 +142,9 @@ def test_a_finished_conversion_is_only_opened(raw: Path, tmp_path: Path) -> None
 
 def test_another_conversion_is_not_mixed_in(raw: Path, tmp_path: Path) -> None:
     convert("womd", [raw], tmp_path / "out")
-    with pytest.raises(SceneError, match="another options"):
+    with pytest.raises(SceneError, match="another conversion .'shard_size': 256 there, 3 here"):
         convert("womd", [raw], tmp_path / "out", shard_size=3)
-    with pytest.raises(SceneError, match="another plan"):
+    with pytest.raises(SceneError, match="another conversion .'plan'"):
         convert("womd", [raw / "a.tfrecord"], tmp_path / "out")
     with pytest.raises(SceneError, match="holds 'a.tfrecord' and no store"):
         convert("womd", [raw], raw)

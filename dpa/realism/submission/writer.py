@@ -28,6 +28,7 @@ from dpa.realism.submission import wire
 from dpa.realism.submission.convert import encode_rollouts, present_ids
 from dpa.realism.submission.messages import NUM_ROLLOUTS, CorruptError, ScenarioRollouts, SubmissionError
 from dpa.realism.submission.metadata import Metadata
+from envs.options import differences
 from envs.progress import progress
 from envs.scene import Scene
 from envs.shards import write_json
@@ -369,15 +370,8 @@ def _check_rules(scene: Scene, poses: Tensor, controlled: Tensor | None) -> None
 
 
 def _check_same(where: Path, there: Mapping[str, Any], here: Mapping[str, Any]) -> None:
-    def flat(options: Mapping[str, Any]) -> dict[str, Any]:
-        decided_by = {f"decided_by.{name}": value for name, value in options.get("decided_by", {}).items()}
-        return {name: value for name, value in options.items() if name != "decided_by"} | decided_by
-
-    there, here = flat(there), flat(here)
-    differ = [name for name in sorted(there.keys() | here.keys()) if there.get(name) != here.get(name)]
-    if differ:
-        shown = "; ".join(f"{name}: {there.get(name)!r} there, {here.get(name)!r} here" for name in differ[:3])
-        raise SubmissionError(f"{where} was written with other options ({shown}); remove it, or name another file.")
+    if differ := differences(there, here):
+        raise SubmissionError(f"{where} was written with other options ({differ}); remove it, or name another file.")
 
 
 def _sync_folder(folder: Path) -> None:

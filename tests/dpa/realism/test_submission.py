@@ -250,10 +250,10 @@ def test_other_rollouts_are_not_mixed_in(tmp_path: Path) -> None:
     path = tmp_path / "mine.tar.gz"
     with open_writer(path) as writer:
         writer.add(0, SCENES[0], ROLLOUTS[0])
-    with pytest.raises(SubmissionError, match=r"other options \(decided_by.seed: 0 there, 1 here\)"):
+    with pytest.raises(SubmissionError, match=r"other options \('decided_by.seed': 0 there, 1 here\)"):
         open_writer(path, decided_by={"seed": 1})
     write(path, (1, 2, 3))
-    with pytest.raises(SubmissionError, match=r"mine.tar.gz was written with other options \(num_shards: 2 there"):
+    with pytest.raises(SubmissionError, match=r"mine.tar.gz was written with other options \('num_shards': 2 there"):
         open_writer(path, num_shards=1)
 
 

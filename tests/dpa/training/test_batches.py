@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from dpa.policy import ContextOptions, make_context
 from dpa.tokens import VerletTokenizer
-from dpa.training.batches import Item, ShuffledOrder, collate_items, crop_agents, log_item, micro_batches
+from dpa.training.batches import Item, LogReader, ShuffledOrder, collate_items, crop_agents, log_item, micro_batches
+from envs.augment import Augmentation
 from envs.seeding import make_generator
 from envs.sources.synthetic import build_scene, straight_road
 
@@ -67,35 +68,33 @@ def test_agents_that_are_not_controlled_or_leave_the_log_have_no_valid_tokens() 
 
 
 def test_a_crowd_is_cropped_to_the_agents_around_one_of_them() -> None:
-    crowd = item(9)
-    cropped = crop_agents(crowd, 4, make_generator(0, "crop", 5))
-    assert cropped.tokens.shape == (1, 4, 16) and cropped.token_valid.shape == (4, 16)
-    x = cropped.context.recent[:, -1, 0]
+    cropped = crop_agents(make_context(straight_road(9)), 4, make_generator(0, "crop", 5))
+    assert cropped.kind.shape == (4,)
+    x = cropped.recent[:, -1, 0]
     assert ((x[:-1] - x[1:]) == 15).all(), "in file, 15 m apart: four neighbours, in the order of the scene"
-    first = int(((crowd.context.recent[:, -1, 0] - x[0]).abs() < 1e-3).nonzero()[0])
-    assert torch.equal(cropped.tokens, crowd.tokens[:, first : first + 4])
 
 
 def test_cropping_depends_on_the_generator_alone() -> None:
-    crowd = item(9)
-    draws = [crop_agents(crowd, 4, make_generator(0, "crop", step)).context.recent for step in (1, 1, 2, 3, 4)]
+    crowd = make_context(straight_road(9))
+    draws = [crop_agents(crowd, 4, make_generator(0, "crop", step)).recent for step in (1, 1, 2, 3, 4)]
     assert torch.equal(draws[0], draws[1])
     assert any(not torch.equal(draws[0], other) for other in draws[2:])
 
 
 def test_few_agents_are_left_alone() -> None:
-    few = item(3)
+    few = make_context(straight_road(3))
     assert crop_agents(few, 3, make_generator(0)) is few
 
 
-def test_noisy_logs_have_labels_of_their_own_that_are_cropped_with_them() -> None:
-    context, tokenizer = make_context(straight_road(9)), VerletTokenizer()
-    noisy = log_item(context, tokenizer, noise=0.5, generator=make_generator(0, "noise"))
-    assert not torch.equal(noisy.tokens, noisy.labels)
-    cropped = crop_agents(noisy, 4, make_generator(0, "crop", 5))
-    plain = crop_agents(item(9), 4, make_generator(0, "crop", 5))
-    kept = [int((context.recent[:, -1, 0] == x).nonzero()[0]) for x in plain.context.recent[:, -1, 0]]
-    assert torch.equal(cropped.labels, noisy.labels[:, kept]) and torch.equal(cropped.tokens, noisy.tokens[:, kept])
+def test_a_log_is_read_as_the_generator_says() -> None:
+    read = LogReader(VerletTokenizer(), ContextOptions(), Augmentation(mirror=0.5), noise=0.5, max_agents=4)
+    crowd = straight_road(9, seed=1)
+    items = [read(crowd, make_generator(0, draw)) for draw in (0, 0, 1, 2, 3, 4)]
+    assert all(one.tokens.shape == (1, 4, 16) for one in items)
+    assert torch.equal(items[0].tokens, items[1].tokens) and torch.equal(items[0].labels, items[1].labels)
+    assert not torch.equal(items[0].tokens, items[0].labels), "noise changes tokens and labels lead back"
+    sides = {float(one.context.recent[0, -1, 1].sign()) for one in items}
+    assert sides == {-1.0, 1.0}, "some are mirrored"
 
 
 def test_labels_are_the_tokens_where_nothing_else_is_said() -> None:
