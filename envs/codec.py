@@ -27,6 +27,9 @@ LEVEL = 6
 MAX_BYTES = 1 << 28
 """No scene is larger when unpacked; a damaged header must not claim the memory of the machine."""
 
+MOST_AGENTS = 100_000
+"""Of one scene: an agent that is never valid takes some bytes when packed and 2 KB in memory."""
+
 _PARTS = {"agents": Agents, "road": RoadMap, "lights": Lights}
 _TABLES = ("scene", "agents", "states", "points", "polylines", "links", "lights", "listings", "letters")
 _HEADER = struct.Struct(f"<{len(_TABLES)}I")
@@ -124,12 +127,20 @@ def decode(block: bytes) -> Scene:
     expected = _HEADER.size + num_rows["letters"] + sum(_num_bytes(num_rows[c.table], c) for c in _COLUMNS)
     if len(data) != expected or num_rows["scene"] != 1:
         raise SceneError(f"the block of the scene has {len(data)} bytes where its header asks for {expected}.")
+    if num_rows["agents"] > MOST_AGENTS:
+        raise SceneError(f"the block of the scene claims {num_rows['agents']} agents; at most {MOST_AGENTS} are read.")
+    if num_rows["listings"] != num_rows["lights"] * LOG_STEPS:
+        raise SceneError(f"the block of the scene has {num_rows['listings']} listings of {num_rows['lights']} lights.")
     arrays, offset = {}, _HEADER.size
     for column in _COLUMNS:
         size = _num_bytes(num_rows[column.table], column)
         arrays[column.name] = _unpack(data[offset : offset + size], num_rows[column.table], column)
         offset += size
-    return _scene(arrays, bytes(data[offset:]).decode())
+    try:
+        scene_id = bytes(data[offset:]).decode()
+    except UnicodeDecodeError as error:
+        raise SceneError(f"the block of the scene has an id that is no text ({error}).") from error
+    return _scene(arrays, scene_id)
 
 
 def _rows(scene: Scene, column: _Column) -> np.ndarray:
@@ -189,7 +200,7 @@ def _scene(arrays: dict[str, np.ndarray], scene_id: str) -> Scene:
     valid, count = arrays["agents.valid"], arrays["road.count"]
     for name in _AT_VALID_STATES:
         if len(arrays[name]) != np.count_nonzero(valid):
-            raise SceneError(f"the block of scene {scene_id} has {len(arrays[name])} states of {valid.sum()}.")
+            raise SceneError(f"the block of the scene has {len(arrays[name])} states of {valid.sum()}.")
         arrays[name] = _spread(arrays[name], valid)
     for name in ("lights.state", "lights.stop_point"):
         arrays[name] = arrays[name].reshape(-1, LOG_STEPS, *arrays[name].shape[1:])

@@ -23,6 +23,8 @@ LOG_STEPS = 91
 """L: logged steps in a scene."""
 CURRENT_STEP = 10
 """Index of the current step: ten steps of history lie before it, eighty follow."""
+LARGEST_NUMBER = 1e7
+"""No coordinate in metres, angle or speed is larger: a quarter of the Earth's meridian, the largest UTM northing."""
 
 
 class SceneError(ValueError):
@@ -247,69 +249,14 @@ class Scene(TensorClass["nocast"]):
             name: what to call the scene in an error (a file and record); its ``scene_id`` by default.
 
         Raises:
-            SceneError: no SDC, no agent at the current step, no road edge, a value that is not finite, or fields whose
-                sizes disagree. The message names the scene, the field and the fix.
+            SceneError: no SDC, no agent at the current step, no road edge, a value that is not finite or beyond
+                :data:`LARGEST_NUMBER`, a number that stands for nothing, or fields whose sizes disagree. The message
+                names the scene, the field and the fix.
         """
-        name = f"{name} (scene {self.scene_id})" if name else f"scene {self.scene_id}"
-        _check_tracks(self.agents, name)
-        _check_map(self.road, name)
-        _check_finite(name, self.lights.lane_id, "light of lane", stop_point=self.lights.stop_point)
+        from envs.validation import check_scene
+
+        check_scene(self, name)
         return self
-
-
-def _check_tracks(agents: Agents, name: str) -> None:
-    num_agents = agents.position.shape[0]
-    if agents.position.shape != (num_agents, LOG_STEPS, 3) or agents.valid.shape != (num_agents, LOG_STEPS):
-        raise SceneError(
-            f"{name}: tracks must have {LOG_STEPS} steps of 0.1 s, got positions of shape "
-            f"{tuple(agents.position.shape)}. Cut or resample the recording."
-        )
-    if int(agents.sdc.sum()) != 1:
-        raise SceneError(f"{name}: {int(agents.sdc.sum())} agents are marked as SDC; mark exactly one.")
-    if not agents.present.any():
-        raise SceneError(f"{name}: no agent is valid at the current step {CURRENT_STEP}; leave the scene out.")
-    if not agents.present[agents.sdc].all():
-        raise SceneError(f"{name}: the SDC is not valid at the current step {CURRENT_STEP}; leave the scene out.")
-    for field in ("position", "heading", "velocity"):
-        values = getattr(agents, field)
-        shown = torch.where(agents.valid.reshape(agents.valid.shape + (1,) * (values.ndim - 2)), values, 0.0)
-        _check_finite(name, agents.track_id, "track", **{field: shown})
-    _check_finite(name, agents.track_id, "track", extent=agents.extent)
-    flat = agents.present & ~(agents.extent > 0).all(-1)
-    if flat.any():
-        agent = int(flat.nonzero()[0])
-        raise SceneError(
-            f"{name}: track {int(agents.track_id[agent])} has the extent {agents.extent[agent].tolist()} at the "
-            "current step (length, width, height), which must be positive; give its box, or mark it invalid."
-        )
-
-
-def _check_map(road: RoadMap, name: str) -> None:
-    if not torch.equal(road.start, road.count.cumsum(0) - road.count) or int(road.count.sum()) != len(road.points):
-        raise SceneError(f"{name}: the points of the polylines must lie behind each other, in the polylines' order.")
-    if not torch.isfinite(road.points).all():
-        point = int((~torch.isfinite(road.points)).any(-1).nonzero()[0])
-        line = int(torch.searchsorted(road.start + road.count, point, right=True))
-        raise SceneError(
-            f"{name}: map feature {int(road.feature_id[line])} has the point {road.points[point].tolist()}, which is "
-            "not finite in float32; remove the polyline."
-        )
-    _check_finite(name, road.feature_id, "map feature", speed_limit=road.speed_limit)
-    edges = torch.isin(road.kind, torch.tensor(EDGE_KINDS)) & (road.count >= 2)
-    if not edges.any():
-        raise SceneError(f"{name}: the map has no road edge of two points or more; off-road is undefined.")
-
-
-def _check_finite(name: str, ids: Tensor, what: str, **fields: Tensor) -> None:
-    for field, values in fields.items():
-        good = torch.isfinite(values)
-        if not good.all():
-            row = int((~good).flatten(1).any(1).nonzero()[0]) if values.ndim > 1 else int((~good).nonzero()[0])
-            bad = values[~good][0].item()
-            raise SceneError(
-                f"{name}: {what} {int(ids[row])} has {field} {bad} (in float32), which is not finite; mark it invalid "
-                "or leave it out."
-            )
 
 
 @runtime_checkable

@@ -22,8 +22,10 @@ from typing import Any, TypeVar
 import zstandard
 
 from envs.card import Card
-from envs.codec import LEVEL, MAX_BYTES, decode, encode
+from envs.codec import LEVEL, decode, encode
 from envs.scene import Scene, SceneError
+from envs.sources.fields import one_line, shown
+from envs.validation import check_scene_id
 
 Content = TypeVar("Content")
 
@@ -34,6 +36,25 @@ SUFFIX = ".scenes"
 PARTIAL_PREFIX = ".partial-"
 """Files that are being written; left over only by a process that was killed."""
 
+MAX_RECORD = 1 << 25
+"""Bytes of an unpacked record: that of 256 scenes has about 50,000, and decoded JSON can take forty times its size."""
+MAX_JSON = 1 << 27
+"""Bytes of a manifest; one that lists a hundred thousand bad inputs has about 2^25."""
+
+_SKIPPED = [{"input": str, "record": int, "error": str}]
+_RECORD_SHAPE = {
+    "scene_ids": [str],
+    "units": [(str, int)],
+    "sizes": [int],
+    "num_agents": [int],
+    "has_lights": [bool],
+    "lacks": [int],
+    "skipped": _SKIPPED,
+    "notes": {str: int},
+    "card": {str: {str: int}},
+    "last": bool,
+}
+"""Of the fields of :class:`ShardRecord`, see :func:`check_shape`."""
 _MAGIC = b"SCENES\x00" + bytes([FORMAT_VERSION])
 _FOOTER = struct.Struct(f"<Q{len(_MAGIC)}s")
 
@@ -159,7 +180,10 @@ class Shard:
             with self.path.open("rb") as file:
                 file.seek(self._offsets[row])
                 block = file.read(self.record.sizes[row])
-            return decode(block)
+            scene = decode(block)
+            if scene.scene_id != self.record.scene_ids[row]:
+                raise SceneError(f"it holds the scene {shown(scene.scene_id)} instead.")
+            return scene
         except (OSError, SceneError) as error:
             name = f"{self.path}, scene {row} ({self.record.scene_ids[row]})"
             raise SceneError(f"{name}: {error} Convert the scenes again.") from error
@@ -180,21 +204,84 @@ def read_record(path: Path) -> ShardRecord:
             if magic != _MAGIC or not 0 < length <= size - _FOOTER.size:
                 raise SceneError(f"{path}: no shard of version {FORMAT_VERSION}, or a cut one; convert again.")
             file.seek(size - _FOOTER.size - length)
-            content = json.loads(_unpacked(file.read(length)))
+            content = dict(json.loads(_unpacked(file.read(length))))
         if content.pop("version") != FORMAT_VERSION:
             raise SceneError(f"{path}: of another version than {FORMAT_VERSION}; convert the scenes again.")
-        content["units"] = [(name, record) for name, record in content["units"]]
-        return ShardRecord(**content)
+        record = ShardRecord(**content)
+        _check_record(record, path, size - _FOOTER.size - length)
+        return record
     except FileNotFoundError as error:
         raise SceneError(f"{path}: the file is missing; convert the scenes again.") from error
     except SceneError:
         raise
-    except (OSError, KeyError, TypeError, ValueError, zstandard.ZstdError) as error:
-        raise SceneError(f"{path}: damaged ({error}); convert the scenes again.") from error
+    except (OSError, KeyError, RecursionError, TypeError, ValueError, zstandard.ZstdError) as error:
+        raise SceneError(f"{path}: damaged ({one_line(error)}); convert the scenes again.") from error
+
+
+def _check_record(record: ShardRecord, path: Path, end: int) -> None:
+    """The record must fit itself and the blocks before it, which end at ``end``."""
+    for name, shape in _RECORD_SHAPE.items():
+        check_shape(getattr(record, name), shape, name)
+    record.units = [(name, number) for name, number in record.units]
+    for name in ("units", "sizes", "num_agents", "has_lights", "lacks"):
+        if len(getattr(record, name)) != len(record.scene_ids):
+            raise ValueError(f"{name} has not one value for each of {len(record.scene_ids)} scenes")
+    if len(_MAGIC) + sum(record.sizes) != end:
+        raise ValueError("sizes are not those of the scenes")
+    for scene_id in record.scene_ids:
+        check_scene_id(scene_id, str(path))
+
+
+def check_shape(value: Any, shape: Any, name: str) -> None:
+    """Compare decoded JSON with what it must be.
+
+    Args:
+        value: decoded.
+        shape: a type (``int`` is a whole number that is not negative, ``object`` is anything), ``[shape]`` of a list,
+            a tuple of the shapes of a list's items, ``{str: shape}`` of an object of any keys, or the shapes of an
+            object's entries by their keys.
+        name: of the value.
+
+    Raises:
+        ValueError: naming what is of another shape.
+
+    Examples:
+        >>> check_shape({"a": [1, -2]}, {str: [int]}, "counts")
+        Traceback (most recent call last):
+        ...
+        ValueError: counts['a'][1] is -2, which it must not be
+    """
+    found = _misfit(value, shape)
+    if found is not None:
+        place, wrong = found
+        raise ValueError(f"{name}{place} is {shown(wrong)}, which it must not be")
+
+
+def _misfit(value: Any, shape: Any) -> tuple[str, Any] | None:
+    """Where below a value and what is of another shape, if anything is."""
+    if isinstance(shape, list):
+        fits = isinstance(value, list)
+        below = ((index, shape[0]) for index in range(len(value) if fits else 0))
+    elif isinstance(shape, tuple):
+        fits, below = isinstance(value, list) and len(value) == len(shape), enumerate(shape)
+    elif isinstance(shape, dict) and str in shape:
+        fits = isinstance(value, dict)
+        below = ((key, shape[str]) for key in (value if fits else ()))
+    elif isinstance(shape, dict):
+        fits, below = isinstance(value, dict) and value.keys() == shape.keys(), shape.items()
+    else:
+        fits = type(value) is int and 0 <= value < 2**63 if shape is int else isinstance(value, shape)
+        below = ()
+    if not fits:
+        return "", value
+    for key, inner in below:
+        if (found := _misfit(value[key], inner)) is not None:
+            return f"[{shown(key)}]{found[0]}", found[1]
+    return None
 
 
 def _unpacked(packed: bytes) -> bytes:
-    if not 0 <= zstandard.frame_content_size(packed) <= MAX_BYTES:
+    if not 0 <= zstandard.frame_content_size(packed) <= MAX_RECORD:
         raise ValueError("a record of that size is none of ours")
     return zstandard.ZstdDecompressor().decompress(packed)
 
@@ -230,21 +317,33 @@ def write_json(path: Path, content: Any) -> None:
     write_bytes(path, (json.dumps(content) + "\n").encode())
 
 
-def read_versioned(path: Path, cls: type[Content]) -> Content:
+def read_versioned(path: Path, cls: type[Content], shape: dict[str, Any]) -> Content:
     """Read a JSON file of the store into its dataclass.
+
+    Args:
+        path: of the file.
+        cls: what it holds.
+        shape: of its fields, see :func:`check_shape`.
 
     Raises:
         SceneError: no such file, damaged, or of another version than :data:`FORMAT_VERSION`.
     """
     try:
+        if path.stat().st_size > MAX_JSON:
+            raise SceneError(f"{path}: has more than {MAX_JSON} bytes; convert the scenes again.")
         content = dict(json.loads(path.read_text(encoding="utf-8")))
         version = content.pop("version", None)
         if version != FORMAT_VERSION:
-            raise SceneError(f"{path}: version {version} where {FORMAT_VERSION} is read; convert the scenes again.")
-        return cls(**content)
+            raise SceneError(
+                f"{path}: version {shown(version)} where {FORMAT_VERSION} is read; convert the scenes again."
+            )
+        result = cls(**content)
+        for name, inner in shape.items():
+            check_shape(getattr(result, name), inner, name)
+        return result
     except FileNotFoundError as error:
         raise SceneError(f"{path}: the file is missing; convert the scenes again.") from error
     except SceneError:
         raise
-    except (TypeError, ValueError) as error:
-        raise SceneError(f"{path}: damaged ({error}); convert the scenes again.") from error
+    except (OSError, RecursionError, TypeError, ValueError) as error:
+        raise SceneError(f"{path}: damaged ({one_line(error)}); convert the scenes again.") from error

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from envs.scene import Lacks, Scene, SceneError
-from envs.shards import FORMAT_VERSION, Shard, file_digest, read_versioned, write_json
+from envs.shards import FORMAT_VERSION, SUFFIX, Shard, file_digest, read_versioned, write_json
+from envs.sources.fields import shown
 
 MANIFEST_FILE = "manifest.json"
 """In the folder of a store: its :class:`Manifest`."""
@@ -46,6 +47,17 @@ class Manifest:
     notes: dict[str, int] = field(default_factory=dict)
 
 
+_MANIFEST_SHAPE = {
+    "source": str,
+    "options": {str: object},
+    "plan": str,
+    "complete": bool,
+    "shards": [{"name": str, "scenes": int, "sha256": str}],
+    "skipped": [{"input": str, "record": int, "error": str}],
+    "notes": {str: int},
+}
+
+
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write or replace the manifest of a store."""
     write_json(folder / MANIFEST_FILE, {"version": FORMAT_VERSION, **asdict(manifest)})
@@ -57,7 +69,7 @@ def read_manifest(folder: Path) -> Manifest:
     Raises:
         SceneError: there is none, it is damaged or of another version.
     """
-    return read_versioned(folder / MANIFEST_FILE, Manifest)
+    return read_versioned(folder / MANIFEST_FILE, Manifest, _MANIFEST_SHAPE)
 
 
 class SceneStore:
@@ -250,8 +262,8 @@ class SceneStore:
         for entry, shard in zip(entries, self._shards, strict=True):
             if file_digest(shard.path) != entry["sha256"]:
                 raise SceneError(f"{shard.path}: changed since it was written; convert the scenes again.")
-            for row, (name, record) in enumerate(shard.record.units):
-                shard.scene(row).validate(f"{name}, record {record}")
+            for row in range(len(shard.record.units)):
+                shard.scene(row).validate(f"{shard.path}, scene {row}")
                 tick()
 
     @cached_property
@@ -260,7 +272,7 @@ class SceneStore:
 
     @property
     def _folder_of_rows(self) -> np.ndarray:
-        return np.array(self._owner)[np.searchsorted(self._starts, self._rows, side="right") - 1]
+        return np.array(self._owner, dtype=np.int64)[np.searchsorted(self._starts, self._rows, side="right") - 1]
 
     def _gather(self, field: str, dtype: type) -> np.ndarray:
         values = [value for shard in self._shards for value in getattr(shard.record, field)]
@@ -275,7 +287,10 @@ class SceneStore:
 
 
 def _open(folder: Path, entry: dict[str, Any]) -> Shard:
-    shard = Shard(folder / entry["name"])
+    name = entry["name"]
+    if not name.endswith(SUFFIX) or not name.isprintable() or "/" in name:
+        raise SceneError(f"{folder / MANIFEST_FILE}: no shard can be named {shown(name)}; convert the scenes again.")
+    shard = Shard(folder / name)
     if len(shard.record.scene_ids) != entry["scenes"]:
         raise SceneError(
             f"{shard.path}: {len(shard.record.scene_ids)} scenes where the manifest has {entry['scenes']}; "

@@ -27,8 +27,9 @@ from scipy.spatial import cKDTree
 from envs.scene import CURRENT_STEP, LOG_STEPS, AgentKind, Lacks, Scene, SceneError
 from envs.sources.argoverse_map import read_map
 from envs.sources.argoverse_tracks import MOST_ROWS, NUMBER_COLUMNS, TEXT_COLUMNS, WHOLE_COLUMNS, read_tracks
-from envs.sources.fields import Field, decode_json, shown
+from envs.sources.fields import Field, decode_json, one_line, shown
 from envs.sources.files import find_files, read_file
+from envs.sources.parquet_pages import ENCODINGS, read_pages
 from envs.sources.recording import Polyline, Recording
 from envs.sources.source import Notes, Record, Source
 
@@ -67,8 +68,8 @@ GROUND_STEPS = 5
 _LACKS = Lacks.HEIGHT | Lacks.SIZES | Lacks.LIGHTS | Lacks.SPEED_LIMITS
 
 LARGEST_PARQUET = 64 * 2**20
-LARGEST_MAP = 64 * 2**20
-LARGEST_DATA = 512 * 2**20
+LARGEST_MAP = 32 * 2**20
+LARGEST_DATA = 128 * 2**20
 """Bytes of a parquet file, of a map, and of a parquet file's columns once unpacked, beyond which it is refused; a
 scenario has about 0.3, 0.1 and 0.5 MB."""
 
@@ -179,6 +180,7 @@ def _decode_parquet(data: bytes, name: str) -> dict[str, np.ndarray]:
     try:
         metadata = parquet.read_metadata(pyarrow.BufferReader(data))
         _check_size(metadata, name)
+        _check_pages(data, metadata, name)
         there = set(metadata.schema.to_arrow_schema().names)
         wanted = [field for field in (*TEXT_COLUMNS, *WHOLE_COLUMNS, *NUMBER_COLUMNS) if field in there]
         # Text stays a table of its different values: a few bytes of a file could unpack to a long text in each row.
@@ -192,7 +194,9 @@ def _decode_parquet(data: bytes, name: str) -> dict[str, np.ndarray]:
     except SceneError:
         raise
     except Exception as error:  # whatever a damaged file makes of the decoder, its fault is the file
-        raise SceneError(f"{name}: not a parquet file that can be read ({error}); fetch the file again.") from error
+        raise SceneError(
+            f"{name}: not a parquet file that can be read ({one_line(error)}); fetch the file again."
+        ) from error
 
 
 def _check_size(metadata: Any, name: str) -> None:
@@ -202,6 +206,23 @@ def _check_size(metadata: Any, name: str) -> None:
         raise SceneError(f"{name}: it has {metadata.num_rows} rows; at most {MOST_ROWS} are read.")
     if not 0 <= size <= LARGEST_DATA:
         raise SceneError(f"{name}: it has {size} bytes once unpacked; at most {LARGEST_DATA} are read.")
+
+
+def _check_pages(data: bytes, metadata: Any, name: str) -> None:
+    """The pages themselves, which need not be as large as the footer says."""
+    size = 0
+    for group in range(metadata.num_row_groups):
+        for index in range(metadata.num_columns):
+            column = metadata.row_group(group).column(index)
+            for page in read_pages(data, column):
+                size += page.unpacked
+                if page.encoding is not None and page.encoding not in ENCODINGS:
+                    raise SceneError(
+                        f"{name}: column {shown(column.path_in_schema)[1:-1]} has the encoding {page.encoding}; only "
+                        f"{', '.join(ENCODINGS.values())} are read."
+                    )
+    if size > LARGEST_DATA:
+        raise SceneError(f"{name}: its pages have {size} bytes once unpacked; at most {LARGEST_DATA} are read.")
 
 
 def _to_numpy(column: Any) -> np.ndarray:

@@ -33,6 +33,8 @@ POINT_SPACING = 2.0
 """Largest gap between two points of a line [m]: that of the centrelines in the files."""
 LONGEST_MAP = 1_000_000.0
 """Length of all lines together beyond which a map is refused [m]; a scenario has about 10 km."""
+MOST_CORNERS = 50_000
+"""Of all drivable areas together; a scenario has some thousands, and their union takes seconds for this many."""
 HAIRLINE = 0.05
 """Half the width of gaps between drivable areas that abut; they are closed [m]."""
 _DIRECTION_SAMPLES = 9
@@ -201,6 +203,8 @@ def _road_edges(areas: Field) -> list[_Draft]:
     corners = [area["area_boundary"].table("x", "y", "z", at_least=3) for area in areas.entries()]
     if not corners:
         return []  # Scene.validate says that there is no road edge
+    if sum(map(len, corners)) > MOST_CORNERS:
+        raise SceneError(f"{areas.name}: {areas.path} has {sum(map(len, corners))} corners; at most {MOST_CORNERS}.")
     polygons = [_polygon(points[:, :2], area) for points, area in zip(corners, areas.entries(), strict=True)]
     points = np.concatenate(corners)
     tree = cKDTree(points[:, :2])

@@ -9,18 +9,21 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import reprlib
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from envs.scene import SceneError
+from envs.scene import LARGEST_NUMBER, SceneError
 
-LARGEST_NUMBER = 1e7
-"""No coordinate in metres, angle or speed is larger: a quarter of the Earth's meridian, the largest UTM northing."""
 LARGEST_ID = 2**62
 """Ids up to this one fit int64 with room to count on from them."""
+MOST_ITEMS = 200_000
+"""Of one list or object that is asked item by item; the lists of a scene have some thousands."""
+_KEY = re.compile(r"-?[0-9]{1,18}")
+"""An id as the key of an entry, within int64."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +34,7 @@ class Field:
         value: what the decoder gave.
         name: the file and record, for errors.
         path: how the value was reached from the top, for errors.
+        key: of an entry of an object that was asked for all of them.
 
     Examples:
         >>> top = Field({"lanes": {"7": {"id": 7, "left": [{"x": 1, "y": 2.5}, {"x": "abc", "y": 3}]}}}, "a.json")
@@ -46,6 +50,7 @@ class Field:
     value: Any
     name: str
     path: str = ""
+    key: str = ""
 
     def error(self, must: str) -> SceneError:
         """The error that says what the value is and what it ``must`` be."""
@@ -68,15 +73,22 @@ class Field:
         """All values of an object, in the order of the file."""
         if not isinstance(self.value, dict):
             raise self.error("be an object")
-        return [Field(value, self.name, f"{self.path}[{str(key)[:40]}]") for key, value in self.value.items()]
+        self._check_count(0)
+        return [Field(value, self.name, f"{self.path}[{shown(key)[1:-1]}]", key) for key, value in self.value.items()]
 
     def items(self, at_least: int = 0) -> list[Field]:
         """All values of a list, which must have ``at_least`` so many."""
         if not isinstance(self.value, list):
             raise self.error("be a list")
-        if len(self.value) < at_least:
-            raise SceneError(f"{self.name}: {self.path} has {len(self.value)} items; must have {at_least} or more.")
+        self._check_count(at_least)
         return [Field(value, self.name, f"{self.path}[{index}]") for index, value in enumerate(self.value)]
+
+    def _check_count(self, at_least: int) -> None:
+        count = len(self.value)
+        if count < at_least:
+            raise SceneError(f"{self.name}: {self.path} has {count} items; must have {at_least} or more.")
+        if count > MOST_ITEMS:
+            raise SceneError(f"{self.name}: {self.path} has {count} items; at most {MOST_ITEMS} are read.")
 
     def number(self, largest: float = LARGEST_NUMBER, *, finite: bool = True) -> float:
         """A finite number of a size that is at most ``largest``; NaN instead of any other one unless ``finite``."""
@@ -99,10 +111,9 @@ class Field:
 
     def key_as_integer(self) -> int:
         """The whole number that is the key of this entry of an object (JSON has no other keys than text)."""
-        key = self.path.rpartition("[")[2].removesuffix("]")
-        if not key.lstrip("-").isdecimal():
+        if not _KEY.fullmatch(self.key):
             raise SceneError(f"{self.name}: the key of {self.path} must be a whole number.")
-        return int(key)
+        return int(self.key)
 
     def text(self) -> str:
         """A string."""
@@ -163,7 +174,18 @@ def decode_json(data: bytes, name: str) -> Field:
     try:
         return Field(json.loads(data), name)
     except (RecursionError, ValueError) as error:  # no JSON, no UTF-8, an endless number
-        raise SceneError(f"{name}: is no JSON ({error}); fetch the file again.") from error
+        raise SceneError(f"{name}: is no JSON ({one_line(error)}); fetch the file again.") from error
+
+
+def one_line(error: Exception) -> str:
+    r"""What another library says is wrong, as a part of one line.
+
+    Examples:
+        >>> one_line(ValueError("no such\ncolumn\n"))
+        'no such column'
+    """
+    text = " ".join(str(error).split())[:300]
+    return text if text.isprintable() else ascii(text)
 
 
 def shown(value: Any) -> str:

@@ -21,14 +21,15 @@ from typing import Any
 import numpy as np
 
 from envs.scene import LOG_STEPS, AgentKind, Lacks, LightState, MapKind, Scene, SceneError
-from envs.sources.fields import Field, decode_json
+from envs.sources.fields import Field, decode_json, one_line
 from envs.sources.files import find_files, read_file
 from envs.sources.recording import KIND_OF_FEATURE, LightListing, Polyline, Recording
 from envs.sources.source import Notes, Record, Source
 
-MAX_BYTES = 1 << 26
-"""Of an unpacked file; a scene has about 5 MB, and decoded JSON takes up to twenty times its size in memory."""
-_OPENERS = {".gz": gzip.open, ".xz": lzma.open}
+MAX_BYTES = 1 << 25
+"""Of an unpacked file; a scene has about 5 MB, and decoded JSON takes up to forty times its size in memory."""
+MAX_XZ_MEMORY = 1 << 28
+"""Bytes for unpacking itself: a file of some bytes can ask for gigabytes; the highest level of xz asks for 65 MiB."""
 _LACKS = Lacks.TOPOLOGY | Lacks.SPEED_LIMITS
 _RADIANS_LIMIT = math.pi + 1e-3
 """No heading in radians is larger; the slack is for float32, whose pi is larger than pi."""
@@ -189,17 +190,27 @@ def _records(path: str) -> Iterator[Record]:
 def _make(path: str, notes: Notes) -> Scene:
     name = f"{path}, record 0"
     packed = read_file(path, MAX_BYTES)
-    opener = _OPENERS.get(Path(path).suffix)
     try:
-        text = packed
-        if opener is not None:
-            with opener(io.BytesIO(packed)) as content:
-                text = content.read(MAX_BYTES + 1)
+        text = _unpacked(packed, Path(path).suffix)
     except (EOFError, OSError, lzma.LZMAError, zlib.error) as error:
-        raise SceneError(f"{name}: cannot be unpacked ({error}); fetch the file again.") from error
+        raise SceneError(f"{name}: cannot be unpacked ({one_line(error)}); fetch the file again.") from error
     if len(text) > MAX_BYTES:
         raise SceneError(f"{name}: has more than {MAX_BYTES >> 20} MiB when unpacked; that is no scene.")
     return scene_from_json(decode_json(text, name), notes)
+
+
+def _unpacked(packed: bytes, suffix: str) -> bytes:
+    """The content of a file; of one that is too large, a byte more than the limit."""
+    if suffix == ".gz":
+        with gzip.open(io.BytesIO(packed)) as content:
+            return content.read(MAX_BYTES + 1)
+    if suffix != ".xz":
+        return packed
+    content = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=MAX_XZ_MEMORY)
+    text = content.decompress(packed, MAX_BYTES + 1)
+    if not content.eof and len(text) <= MAX_BYTES:
+        raise EOFError("the file ends too early")
+    return text
 
 
 GPUDRIVE = Source(

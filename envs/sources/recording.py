@@ -14,6 +14,7 @@ from torch import Tensor
 
 from envs.scene import (
     CURRENT_STEP,
+    LARGEST_NUMBER,
     LOG_STEPS,
     AgentKind,
     Agents,
@@ -26,6 +27,7 @@ from envs.scene import (
     SceneError,
 )
 from envs.sources.source import Notes
+from envs.validation import check_scene_id
 
 KIND_OF_FEATURE = {
     "lane": MapKind.LANE_UNDEFINED,
@@ -39,6 +41,15 @@ KIND_OF_FEATURE = {
 """WOMD's map features by name; the types of lanes, lines and edges count from these kinds on."""
 _MAP_KINDS, _AGENT_KINDS = frozenset(MapKind), frozenset(AgentKind)
 _LIGHT_STATES = frozenset(LightState) - {LightState.ABSENT}
+MOST = {
+    "track": 10_000,
+    "map feature": 100_000,
+    "point of the map": 1_000_000,
+    "light listing": 100_000,
+    "link": 500_000,
+    "track to predict": 10_000,
+}
+"""Of one scene; a file of a megabyte can claim far more, and usual are 100, 500, 20,000, 2,000, 1,000 and 8."""
 _LAST_KIND = {
     "lane": MapKind.LANE_BIKE,
     "road_line": MapKind.LINE_PASSING_YELLOW,
@@ -82,6 +93,18 @@ def light_state(number: int, notes: Notes) -> LightState:
         return LightState(number)
     notes[f"light of unknown state {number}, taken as UNKNOWN"] += 1
     return LightState.UNKNOWN
+
+
+def check_count(what: str, count: int, name: str) -> None:
+    """Refuse a scene that has more of something than any has; a reader asks before it builds them.
+
+    Args:
+        what: a key of :data:`MOST`.
+        count: how many there are.
+        name: what errors call the recording.
+    """
+    if count > MOST[what]:
+        raise SceneError(f"{name}: it has {count} times a {what}; at most {MOST[what]} are read.")
 
 
 @dataclass(frozen=True)
@@ -181,11 +204,21 @@ class Recording:
 
     def _check(self, name: str) -> None:
         num = len(self.track_id)
+        check_scene_id(self.scene_id, name)
+        check_count("track", num, name)
+        check_count("map feature", len(self.polylines), name)
+        check_count("point of the map", sum(len(line.points) for line in self.polylines), name)
+        check_count("light listing", len(self.lights), name)
+        check_count("link", len(self.links), name)
+        check_count("track to predict", len(self.predict), name)
         for role, index in (("SDC", self.sdc), *(("track to predict", i) for i in self.predict)):
             if not 0 <= index < num:
                 raise SceneError(f"{name}: the {role} is track {index} of {num}; give the index of a track.")
-        if len(set(self.track_id)) != num:
-            raise SceneError(f"{name}: two tracks share an id; give every track its own.")
+        seen: set[int] = set()
+        for index, number in enumerate(self.track_id):
+            if number in seen:
+                raise SceneError(f"{name}: two tracks share an id: {number}, of track {index}; give each its own.")
+            seen.add(number)
         ids = {
             "track": self.track_id,
             "map feature": [line.feature_id for line in self.polylines],
@@ -201,7 +234,7 @@ class Recording:
         if not self.valid[self.sdc, CURRENT_STEP]:
             raise SceneError(f"{name}: the SDC is not valid at the current step {CURRENT_STEP}; leave the scene out.")
         here = self.position[self.sdc, CURRENT_STEP]
-        if not np.isfinite(here).all():
+        if not (np.abs(here) <= LARGEST_NUMBER).all():
             raise SceneError(f"{name}: the SDC's position at the current step is {here.tolist()}; leave the scene out.")
         return np.round(here) + 0.0  # no -0.0
 
@@ -229,7 +262,7 @@ class Recording:
     def _road(self, origin: np.ndarray) -> RoadMap:
         lines = self.polylines
         count = torch.tensor([len(line.points) for line in lines], dtype=torch.int64)
-        points = np.array([point for line in lines for point in line.points], dtype=np.float64).reshape(-1, 3)
+        points = np.concatenate([np.reshape(line.points, (-1, 3)) for line in lines] or [np.zeros((0, 3))])
         # Only lanes of this map: WOMD also names neighbours beyond the map's edge, which nobody could look up.
         known = {line.feature_id for line in lines}
         links = sorted({link for link in self.links if link[0] in known and link[1] in known})
@@ -250,14 +283,13 @@ class Recording:
         state = np.full((len(lanes), LOG_STEPS), LightState.ABSENT, dtype=np.int64)
         stop = np.zeros((len(lanes), LOG_STEPS, 3))
         for row in self.lights:
-            point = np.asarray(row.stop_point) - origin
-            if not np.isfinite(point).all():
+            if not all(abs(value) <= LARGEST_NUMBER for value in row.stop_point):
                 raise SceneError(
                     f"{name}: the light of lane {row.lane_id} has the stop point {row.stop_point} at step {row.step}; "
                     "remove the listing."
                 )
             state[index[row.lane_id], row.step] = row.state
-            stop[index[row.lane_id], row.step] = point
+            stop[index[row.lane_id], row.step] = np.asarray(row.stop_point) - origin
         return Lights(
             lane_id=torch.tensor(lanes, dtype=torch.int64),
             state=torch.from_numpy(state),

@@ -19,8 +19,8 @@ _HEADER = struct.Struct("<QI")
 _FOOTER = struct.Struct("<I")
 _CRC_MASK = 0xA282EAD8
 _GZIP_MAGIC = b"\x1f\x8b\x08"
-MAX_PAYLOAD = 1 << 28
-"""No record is larger [bytes]; a scene of WOMD has about a million."""
+MAX_PAYLOAD = 1 << 25
+"""No record is larger [bytes]; a scene of WOMD has about a million. Decoded, two bytes can take a hundred."""
 
 
 def masked_crc(data: bytes) -> int:
@@ -61,7 +61,7 @@ def read_frames(file: BinaryIO, name: str) -> Iterator[Callable[[], bytes]]:
         SceneError: naming the file and the first record whose frame is broken; the rest of the file is lost.
     """
     position = record = 0
-    while head := _read(file, _HEADER.size, f"{name}, record {record}"):
+    while head := read_bytes(file, _HEADER.size, f"{name}, record {record}"):
         length = _length(head)
         if len(head) < _HEADER.size:
             raise SceneError(f"{name}, record {record}: the file ends within the record; fetch the file again.")
@@ -110,21 +110,31 @@ def is_packed(file: BinaryIO) -> bool:
     return head.startswith(_GZIP_MAGIC) and _length(head) is None
 
 
+def read_bytes(file: BinaryIO, size: int, name: str) -> bytes:
+    """Bytes of a file that may be packed, fewer than asked for where it ends.
+
+    Args:
+        file: of :func:`unpacked`.
+        size: how many.
+        name: what errors call the file and record.
+
+    Raises:
+        SceneError: it cannot be unpacked.
+    """
+    try:
+        return file.read(size)
+    except (EOFError, OSError, zlib.error) as error:
+        raise SceneError(f"{name}: cannot be unpacked or read ({error}); fetch the file again.") from error
+
+
 def _read_payload(file: BinaryIO, length: int, name: str) -> bytes:
-    body = _read(file, length + _FOOTER.size, name)
+    body = read_bytes(file, length + _FOOTER.size, name)
     if len(body) != length + _FOOTER.size:
         raise SceneError(f"{name}: the file ends within the record; fetch the file again.")
     payload = body[:length]
     if _FOOTER.unpack(body[length:])[0] != masked_crc(payload):
         raise SceneError(f"{name}: the checksum of the record is wrong; the file is damaged: fetch it again.")
     return payload
-
-
-def _read(file: BinaryIO, size: int, name: str) -> bytes:
-    try:
-        return file.read(size)
-    except (EOFError, OSError, zlib.error) as error:
-        raise SceneError(f"{name}: cannot be unpacked or read ({error}); fetch the file again.") from error
 
 
 def _seek(file: BinaryIO, position: int, name: str) -> None:

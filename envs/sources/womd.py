@@ -10,21 +10,27 @@ from collections.abc import Callable, Iterator
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from envs.scene import CURRENT_STEP, LOG_STEPS, LinkKind, MapKind, Scene, SceneError
+from envs.scene import CURRENT_STEP, LARGEST_NUMBER, LOG_STEPS, LinkKind, MapKind, Scene, SceneError
+from envs.sources.fields import one_line
 from envs.sources.files import find_files, is_remote, open_file
-from envs.sources.recording import LightListing, Polyline, Recording, agent_kind, light_state, map_kind
+from envs.sources.recording import LightListing, Polyline, Recording, agent_kind, check_count, light_state, map_kind
 from envs.sources.scenario import Scenario, unknown_fields
 from envs.sources.source import Notes, Record, Source
-from envs.sources.tfrecord import MAX_PAYLOAD, count_frames, is_packed, read_frames, unpacked
+from envs.sources.tfrecord import MAX_PAYLOAD, count_frames, is_packed, read_bytes, read_frames, unpacked
+from envs.validation import check_scene_id
 
 METRES_PER_SECOND_PER_MPH = 0.44704
 _BARE_SUFFIXES = (".binproto", ".pb")
-_INVALID_STATE = (0.0,) * 9
+_STATE_FIELDS = (
+    *("center_x", "center_y", "center_z", "length", "width", "height"),
+    *("heading", "velocity_x", "velocity_y"),
+)
+_INVALID_STATE = (0.0,) * len(_STATE_FIELDS)
 _POLYGONS = {"crosswalk": MapKind.CROSSWALK, "speed_bump": MapKind.SPEED_BUMP, "driveway": MapKind.DRIVEWAY}
 
 
@@ -61,9 +67,12 @@ def scene_from_scenario(scenario: Any, name: str, notes: Notes | None = None) ->
         notes: counts types and states that are not known.
     """
     notes = Counter() if notes is None else notes
+    check_scene_id(scenario.scenario_id, name)
     name = f"{name} (scene {scenario.scenario_id})"
     _check_steps(scenario, name)
+    _check_counts(scenario, name)
     states = np.array([[_state(state) for state in track.states] for track in scenario.tracks], dtype=np.float64)
+    _check_states(states, name)
     features = scenario.map_features
     return Recording(
         scene_id=scenario.scenario_id,
@@ -85,6 +94,7 @@ def scene_from_scenario(scenario: Any, name: str, notes: Notes | None = None) ->
 def _check_steps(scenario: Any, name: str) -> None:
     if not scenario.tracks:
         raise SceneError(f"{name}: it has no tracks; leave the scene out.")
+    check_count("track", len(scenario.tracks), name)
     for track in scenario.tracks:
         if len(track.states) != LOG_STEPS:
             raise SceneError(
@@ -99,8 +109,34 @@ def _check_steps(scenario: Any, name: str) -> None:
         )
 
 
+def _check_counts(scenario: Any, name: str) -> None:
+    """Two bytes of a file make a point, a listing or a link; what is made of them here has a hundred times as many."""
+    check_count("track to predict", len(scenario.tracks_to_predict), name)
+    check_count("map feature", len(scenario.map_features), name)
+    check_count("light listing", sum(len(step.lane_states) for step in scenario.dynamic_map_states), name)
+    points = links = 0
+    for feature in scenario.map_features:
+        lane = feature.lane
+        points += len(lane.polyline) + len(feature.road_line.polyline) + len(feature.road_edge.polyline)
+        points += sum(len(getattr(feature, field).polygon) for field in _POLYGONS)
+        links += len(lane.exit_lanes) + len(lane.entry_lanes) + len(lane.left_neighbors) + len(lane.right_neighbors)
+    check_count("point of the map", points, name)
+    check_count("link", links, name)
+
+
+def _check_states(states: np.ndarray, name: str) -> None:
+    """``[A, L, 9]``, 0 where invalid."""
+    bad = ~(np.abs(states) <= LARGEST_NUMBER)
+    if bad.any():
+        track, step, field = np.argwhere(bad)[0]
+        raise SceneError(
+            f"{name}: tracks[{track}].states[{step}].{_STATE_FIELDS[field]} is {states[track, step, field]:g}; must be "
+            f"a finite number between -{LARGEST_NUMBER:g} and {LARGEST_NUMBER:g}, or the state must be invalid."
+        )
+
+
 def _state(state: Any) -> tuple[float, ...]:
-    """Position (3), size (3), heading and velocity (2) of one state."""
+    """Position (3), size (3), heading and velocity (2) of one state, in the order of the fields' names."""
     if not state.valid:
         return _INVALID_STATE
     return (
@@ -171,9 +207,16 @@ def payloads(path: str) -> Iterator[Callable[[], bytes]]:
     """
     with open_file(path) as file, unpacked(file) as content:
         if _is_bare(path):
-            yield partial(content.read, MAX_PAYLOAD)
+            yield partial(_read_bare, content, f"{path}, record 0")
         else:
             yield from read_frames(content, path)
+
+
+def _read_bare(file: BinaryIO, name: str) -> bytes:
+    payload = read_bytes(file, MAX_PAYLOAD + 1, name)
+    if len(payload) > MAX_PAYLOAD:
+        raise SceneError(f"{name}: has more than {MAX_PAYLOAD} bytes; at most so many are read.")
+    return payload
 
 
 def _is_bare(path: str) -> bool:
@@ -201,9 +244,11 @@ def _make(read: Callable[[], bytes], name: str, notes: Notes) -> Scene:
     try:
         scenario = Scenario.FromString(payload)
     except DecodeError as error:
-        raise SceneError(f"{name}: not a Scenario proto ({error}); convert WOMD's scenario files.") from error
+        raise SceneError(f"{name}: not a Scenario proto ({one_line(error)}); convert WOMD's scenario files.") from error
+    scene = scene_from_scenario(scenario, name, notes)
+    del scenario  # a large one and its copy are too much
     notes.update(f"unknown field {field}, left out" for field in unknown_fields(payload))
-    return scene_from_scenario(scenario, name, notes)
+    return scene
 
 
 WOMD = Source(

@@ -19,10 +19,12 @@ import torch
 
 from envs.geometry.edges import RoadEdges
 from envs.scene import CURRENT_STEP, EDGE_KINDS, LANE_KINDS, AgentKind, LinkKind, MapKind, Scene, SceneError, polylines
-from envs.sources import argoverse
+from envs.sources import argoverse, argoverse_map
 from envs.sources.argoverse import ARGOVERSE, SIZES, read_argoverse
 from envs.sources.argoverse_map import HAIRLINE, POINT_SPACING
 from envs.sources.fields import Field
+from tests.envs import made
+from tests.envs.made import ground, lane, line, rectangle
 
 pytest.importorskip("shapely", reason="needs the extra argoverse")
 
@@ -33,99 +35,14 @@ def scene_from_tables(columns: dict, map_data: Any, name: str, notes: Counter[st
     return argoverse.scene_from_tables(columns, Field(map_data, name), name, notes)
 
 
-def ground(x: float) -> float:
-    return 50 + 0.02 * (x - 1000)
-
-
-def line(*points: tuple[float, float]) -> list[dict[str, float]]:
-    return [{"x": x, "y": y, "z": ground(x)} for x, y in points]
-
-
-def lane(
-    number: int, left: list, right: list, marks: tuple[str, str] = ("NONE", "NONE"), **more: Any
-) -> dict[str, Any]:
-    return {
-        "id": number,
-        "is_intersection": False,
-        "lane_type": "VEHICLE",
-        "left_lane_boundary": left,
-        "right_lane_boundary": right,
-        "left_lane_mark_type": marks[0],
-        "right_lane_mark_type": marks[1],
-        "predecessors": [],
-        "successors": [],
-        "left_neighbor_id": None,
-        "right_neighbor_id": None,
-        **more,
-    }
-
-
-def along(y: float, start: float = 1000, end: float = 1060) -> list[dict[str, float]]:
-    return line((start, y), (end, y))
-
-
-def rectangle(x0: float, y0: float, x1: float, y1: float) -> dict[str, Any]:
-    return {"area_boundary": line((x0, y0), (x0, y1), (x1, y1), (x1, y0))}  # clockwise, as in the files
-
-
 @pytest.fixture
 def map_data() -> dict[str, Any]:
-    """From the right: a bicycle lane (13), two lanes (10, 11), an oncoming one (12); lane 14 goes on after lane 10."""
-    oncoming = {"left_lane_boundary": along(207)[::-1], "right_lane_boundary": along(210.5)[::-1]}
-    lanes = [
-        lane(10, along(203.5), along(200), ("DASHED_WHITE", "SOLID_WHITE"), successors=[14, 15], left_neighbor_id=11)
-        | {"right_neighbor_id": 13},
-        lane(11, along(207), along(203.5), ("DOUBLE_SOLID_YELLOW", "DASHED_WHITE"), left_neighbor_id=12)
-        | {"right_neighbor_id": 10},
-        lane(12, [], [], ("DOUBLE_SOLID_YELLOW", "UNKNOWN"), left_neighbor_id=11) | oncoming,
-        lane(13, along(200), along(198.5), ("SOLID_WHITE", "NONE"), lane_type="BIKE", left_neighbor_id=10),
-        lane(14, along(203.5, 1060, 1090), along(200, 1060, 1090), predecessors=[10], is_intersection=True),
-    ]
-    return {
-        "lane_segments": {str(item["id"]): item for item in lanes},
-        "pedestrian_crossings": {
-            "5": {"id": 5, "edge1": line((1030, 198), (1030, 211)), "edge2": line((1033, 198), (1033, 211))}
-        },
-        # Two tiles with a hairline between them.
-        "drivable_areas": {
-            "1": {"id": 1, **rectangle(1000, 197, 1059.98, 212)},
-            "2": {"id": 2, **rectangle(1060.02, 197, 1100, 212)},
-        },
-    }
-
-
-def rows(track: str, kind: str, category: int, steps: range, y: float = 201.75) -> list[dict[str, Any]]:
-    return [
-        {
-            "scenario_id": "made",
-            "track_id": track,
-            "object_type": kind,
-            "object_category": category,
-            "timestep": step,
-            "position_x": 1005 + 0.5 * step,
-            "position_y": y,
-            "heading": 0.25,
-            "velocity_x": 5.0,
-            "velocity_y": 0.5,
-        }
-        for step in steps
-    ]
-
-
-def columns_of(table: list[dict[str, Any]]) -> dict[str, np.ndarray]:
-    return {field: np.array([row[field] for row in table], dtype=object).tolist() for field in table[0]}
+    return made.argoverse_map()
 
 
 @pytest.fixture
 def columns() -> dict[str, list]:
-    table = [
-        *rows("7", "vehicle", 3, range(110)),
-        *rows("8", "pedestrian", 2, range(25, 40), y=199.0),
-        *rows("9", "vehicle", 0, range(19)),  # gone before the 91 steps begin
-        *rows("AV", "vehicle", 1, range(110), y=205.0),
-        *rows("4", "cyclist", 2, range(30, 110)),  # comes after the current step
-    ]
-    return columns_of(table)
+    return made.argoverse_columns()
 
 
 def test_the_last_91_steps_are_taken(columns, map_data) -> None:
@@ -604,6 +521,60 @@ def test_too_many_rows_are_refused_before_they_are_unpacked(tmp_path: Path, monk
     monkeypatch.setattr(parquet.ParquetFile, "read", lambda *_, **__: pytest.fail("it was read"))
     with pytest.raises(SceneError, match="record 0: it has 1000001 rows; at most 1000000"):
         read_argoverse(path)
+
+
+def padded(value: int, size: int) -> bytes:
+    """A number as Thrift writes it, in more bytes than it needs."""
+    return bytes(value >> 7 * place & 127 | (128 if place < size - 1 else 0) for place in range(size))
+
+
+def test_pages_that_are_larger_than_the_file_says_are_refused_before_they_are_unpacked(
+    save, columns, monkeypatch
+) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra argoverse")
+    path = save()
+    parquet.write_table(
+        parquet.read_table(path).set_column(2, "object_type", [[*columns["object_type"][:-1], "x" * 1_000_000]]),
+        path,
+        compression="zstd",
+        use_dictionary=False,
+    )
+    group = parquet.read_metadata(path).row_group(0)
+    data = path.read_bytes()
+    for size in (group.total_byte_size, group.column(2).total_uncompressed_size):
+        honest = padded(2 * size, 3)
+        assert honest in data
+        data = data.replace(honest, padded(2 * 1000, 3))
+    path.write_bytes(data)
+    monkeypatch.setattr(argoverse, "LARGEST_DATA", 500_000)
+    monkeypatch.setattr(parquet.ParquetFile, "read", lambda *_, **__: pytest.fail("it was read"))
+    with pytest.raises(SceneError, match=r"record 0: its pages have 1\d{6} bytes once unpacked; at most 500000"):
+        read_argoverse(path)
+
+
+def test_encodings_that_copy_texts_are_refused(save) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra argoverse")
+    path = save()
+    delta = {"object_type": "DELTA_BYTE_ARRAY"}
+    parquet.write_table(parquet.read_table(path), path, use_dictionary=False, column_encoding=delta)
+    with pytest.raises(SceneError, match="record 0: column object_type has the encoding 7; only PLAIN, "):
+        read_argoverse(path)
+
+
+def test_what_the_decoder_says_of_a_damaged_file_is_told_in_one_line(save) -> None:
+    path = save()
+    data = bytearray(path.read_bytes())
+    data[-60:-8] = b"\xff" * 52
+    path.write_bytes(data)
+    with pytest.raises(SceneError, match="not a parquet file that can be read") as caught:
+        read_argoverse(path)
+    assert str(caught.value).isprintable()
+
+
+def test_areas_of_more_corners_than_a_map_has_are_refused(columns, map_data, monkeypatch) -> None:
+    monkeypatch.setattr(argoverse_map, "MOST_CORNERS", 7)
+    with pytest.raises(SceneError, match="made: drivable_areas has 8 corners; at most 7"):
+        scene_from_tables(columns, map_data, "made")
 
 
 @pytest.mark.parametrize("package", ["pyarrow", "shapely"])

@@ -6,6 +6,8 @@ import gzip
 import json
 import lzma
 import math
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,54 +16,20 @@ import numpy as np
 import pytest
 
 from envs.scene import AgentKind, LightState, MapKind, SceneError
+from envs.sources import gpudrive
 from envs.sources.gpudrive import read_gpudrive
 from envs.sources.womd import read_womd
-
-
-def track(x: float, heading: float, **more: Any) -> dict[str, Any]:
-    return {
-        "position": [{"x": x + 0.5 * step, "y": 200.0, "z": 5.0} for step in range(91)],
-        "heading": [heading] * 91,
-        "velocity": [{"x": 5.0, "y": 0.0}] * 91,
-        "valid": [True] * 91,
-        "length": 4.5,
-        "width": 2.0,
-        "height": 1.5,
-        "type": "vehicle",
-        **more,
-    }
-
-
-def road(kind: str, xs: tuple[float, ...], **more: Any) -> dict[str, Any]:
-    return {"geometry": [{"x": x, "y": 195.0, "z": 5.0} for x in xs], "type": kind, **more}
+from tests.envs.made import gpudrive_road, newer_gpudrive, older_gpudrive
 
 
 @pytest.fixture
 def newer() -> dict[str, Any]:
-    return {
-        "name": "x",
-        "scenario_id": "newer",
-        "objects": [track(1000.0, 0.1, id=7), track(1020.0, -3.0, id=9, type="cyclist")],
-        "roads": [
-            road("lane", (900.0, 1100.0), id=3, map_element_id=2),
-            road("road_edge", (900.0, 1100.0), id=4, map_element_id=16),
-        ],
-        "tl_states": {},
-        "metadata": {"sdc_track_index": 0, "objects_of_interest": [], "tracks_to_predict": [{"track_index": 1}]},
-    }
+    return newer_gpudrive()
 
 
 @pytest.fixture
 def older() -> dict[str, Any]:
-    return {
-        "name": "x",
-        "scenario_id": "older",
-        "objects": [track(1000.0, 360.0), track(1020.0, -90.0)],
-        "roads": [road("lane", (900.0, 1100.0)), road("road_edge", (900.0, 1100.0)), road("stop_sign", (950.0,))],
-        "tl_states": {
-            "0": {"state": ["stop", "arrow_go"], "x": [1.0, 2.0], "y": [0, 0], "z": [0, 0], "time_index": [4, 5]}
-        },
-    }
+    return older_gpudrive()
 
 
 @pytest.fixture
@@ -153,6 +121,14 @@ def drop(name: str):
         (lambda data: data["roads"][1]["geometry"][0].update(y=None), r"roads\[1\]\.geometry\[0\]\.y is None"),
         (lambda data: data["metadata"].update(sdc_track_index=5), "SDC is track 5 of 2"),
         (lambda data: data["roads"].pop(), "no road edge"),
+        (lambda data: data.update(scenario_id="\ud800"), r"scenario_id is '\\ud800'; must be text of at most 200"),
+        (lambda data: data.update(scenario_id="x" * 201), "scenario_id is 'xxx.*; must be text of at most 200"),
+        (lambda data: data["objects"][1].update(id=7), "two tracks share an id: 7, of track 1"),
+        (lambda data: data.update(roads=[[]] * 200_001), "roads has 200001 items; at most 200000 are read"),
+        (lambda data: data["tl_states"].update({"--1": {}}), r"the key of tl_states\[--1\] must be a whole number"),
+        (lambda data: data["tl_states"].update({"5[7": {}}), r"the key of tl_states\[5\[7\] must be a whole number"),
+        (lambda data: data["tl_states"].update({"9" * 40: {}}), r"the key of tl_states\[9+\.\.\.9+\] must be a whole"),
+        (lambda data: data["tl_states"].update({"a\nb": {}}), r"the key of tl_states\[a\\nb\] must be a whole number"),
     ],
 )
 def test_an_unusable_file_is_named(newer, save, change, message: str) -> None:
@@ -166,6 +142,26 @@ def test_a_damaged_file_is_named(newer, save, suffix: str) -> None:
     path = save(newer, f"scene{suffix}")
     path.write_bytes(path.read_bytes()[:-40])
     with pytest.raises(SceneError, match=f"scene{suffix}.*(cannot be unpacked|is no JSON)"):
+        read_gpudrive(path)
+
+
+@pytest.mark.parametrize("bits", [36, 38, 40])
+def test_an_xz_file_that_asks_for_gigabytes_is_refused(newer, save, bits: int) -> None:
+    path = save(newer, "scene.json.xz")
+    packed = bytearray(path.read_bytes())
+    end = 12 + (packed[12] + 1) * 4  # of the header of the first block, whose last word is its checksum
+    packed[16] = bits  # size of the dictionary: 1, 2, 4 GiB
+    packed[end - 4 : end] = struct.pack("<I", zlib.crc32(packed[12 : end - 4]))
+    path.write_bytes(packed)
+    with pytest.raises(SceneError, match=r"scene\.json\.xz, record 0: cannot be unpacked \(Memory usage limit"):
+        read_gpudrive(path)
+
+
+@pytest.mark.parametrize("suffix", [".gz", ".xz"])
+def test_a_packed_file_that_is_too_large_is_refused(newer, save, suffix: str, monkeypatch) -> None:
+    path = save(newer, f"scene.json{suffix}")
+    monkeypatch.setattr(gpudrive, "MAX_BYTES", path.stat().st_size)
+    with pytest.raises(SceneError, match=rf"scene\.json\{suffix}, record 0: has more than .* when unpacked"):
         read_gpudrive(path)
 
 
@@ -216,7 +212,7 @@ def test_a_real_radian_recording_that_passes_pi_is_not_turned(shared: Path, save
         for a in range(len(agents.kind))
     ]
     metadata = {"sdc_track_index": int(agents.sdc.nonzero()), "tracks_to_predict": []}
-    edge = road("road_edge", (0.0, 1.0))
+    edge = gpudrive_road("road_edge", (0.0, 1.0))
     path = save({"scenario_id": "w", "objects": objects, "roads": [edge], "tl_states": {}, "metadata": metadata})
     np.testing.assert_array_equal(read_gpudrive(path).agents.heading, agents.heading)
 

@@ -64,6 +64,43 @@ def half_the_log(scene: Scene) -> None:
     scene.agents.position = scene.agents.position[:, :50]
 
 
+def beyond_the_earth(scene: Scene) -> None:
+    scene.agents.position[1, 40, 1] = 1e8
+
+
+def unknown_kind(scene: Scene) -> None:
+    scene.road.kind[0] = 4
+
+
+def negative_count(scene: Scene) -> None:
+    scene.road.count[0], scene.road.count[1] = -1, scene.road.count[:2].sum() + 1
+    scene.road.start = scene.road.count.cumsum(0) - scene.road.count
+
+
+def one_kind_too_few(scene: Scene) -> None:
+    scene.agents.kind = scene.agents.kind[:1]
+
+
+def other_type(scene: Scene) -> None:
+    scene.agents.track_id = scene.agents.track_id.int()
+
+
+def lost_origin(scene: Scene) -> None:
+    scene.origin[0] = torch.nan
+
+
+def unknown_lack(scene: Scene) -> None:
+    scene.lacks.fill_(4096)
+
+
+@pytest.mark.parametrize("scene_id", ["two\nlines", "\ud800", "x" * 201, b"bytes"])
+def test_an_id_that_no_terminal_can_show_is_refused(scene_id: object) -> None:
+    scene = straight_road().clone()
+    scene.scene_id = scene_id
+    with pytest.raises(SceneError, match="train.json, record 3: scenario_id is .*; must be text of at most 200"):
+        scene.validate("train.json, record 3")
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
@@ -75,6 +112,13 @@ def half_the_log(scene: Scene) -> None:
         (flat_box, "track 2 has the extent .* must be positive"),
         (nan_map_point, r"map feature \d has the point .* not finite"),
         (no_edges, "no road edge"),
+        (beyond_the_earth, "track 2 has position 1e.08 at step 40 .* larger than 1e.07"),
+        (unknown_kind, "road.kind holds 4, which is no MapKind"),
+        (negative_count, "points of the polylines must lie behind each other"),
+        (one_kind_too_few, r"agents.kind is torch.int64 of shape \(1,\); must be torch.int64 of shape \(2,\)"),
+        (other_type, "agents.track_id is torch.int32 of shape .*; must be torch.int64"),
+        (lost_origin, r"the origin is \[nan, .*must be finite numbers"),
+        (unknown_lack, "lacks is 4096; must be flags of Lacks"),
         (half_the_log, r"91 steps of 0.1 s, got positions of shape \(2, 50, 3\)"),
     ],
 )

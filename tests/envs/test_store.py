@@ -6,10 +6,15 @@ import contextlib
 import copy
 import hashlib
 import json
+import struct
+from collections.abc import Callable
+from dataclasses import asdict
+from itertools import accumulate, pairwise
 from pathlib import Path
 
 import pytest
 import torch
+import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -211,11 +216,119 @@ def test_an_unfinished_conversion_is_refused(store: SceneStore) -> None:
         SceneStore(*store.folders)
 
 
-@pytest.mark.parametrize("content", ["{", "[]", '{"version": 2}', '{"version": 2, "surprise": 2}'])
+@pytest.mark.parametrize(
+    "content", ["{", "[]", '{"version": 2}', '{"version": 2, "surprise": 2}', "[" * 100_000, "\x00"]
+)
 def test_a_damaged_manifest_is_refused(store: SceneStore, content: str) -> None:
     (store.folders[0] / "manifest.json").write_text(content)
     with pytest.raises(SceneError, match=r"manifest\.json"):
         SceneStore(*store.folders)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"shards": 7}, "damaged .shards is 7, which it must not be"),
+        ({"shards": [{"name": "00000.scenes"}]}, r"damaged .shards\[0\] is "),
+        ({"shards": [{"name": "x.scenes", "scenes": -1, "sha256": ""}]}, r"damaged .shards\[0\]\['scenes'\] is -1"),
+        ({"shards": [{"name": "../x.scenes", "scenes": 1, "sha256": ""}]}, "no shard can be named '../x.scenes'"),
+        ({"notes": {"note": "often"}}, r"damaged .notes\['note'\] is 'often'"),
+        ({"options": None}, "damaged .options is None"),
+        ({"complete": "yes"}, "damaged .complete is 'yes'"),
+        ({"a\nb": 1}, "damaged .*unexpected keyword"),
+    ],
+)
+def test_a_manifest_of_wrong_values_is_named(store: SceneStore, changes: dict, message: str) -> None:
+    change_json(store.folders[0] / "manifest.json", **changes)
+    with pytest.raises(SceneError, match=rf"manifest\.json: {message}") as caught:
+        SceneStore(*store.folders)
+    assert str(caught.value).isprintable()
+
+
+def test_a_store_without_scenes_can_be_asked_for_some(store: SceneStore) -> None:
+    change_json(store.folders[0] / "manifest.json", shards=[])
+    assert len(SceneStore(*store.folders).select(source="made", has_lights=True)) == 0
+
+
+def rewrite(path: Path, change_block: Callable = bytes, **changes: object) -> None:
+    """Write a shard anew, with checksums that fit: its first scene changed, or values of its record."""
+    shard, data = Shard(path), path.read_bytes()
+    ends = [*accumulate(shard.record.sizes, initial=8)]
+    blocks = [data[start:end] for start, end in pairwise(ends)]
+    blocks[0] = zstandard.compress(change_block(zstandard.decompress(blocks[0])))
+    content = {"version": 2, **asdict(shard.record), "sizes": [*map(len, blocks)], **changes}
+    record = zstandard.compress(json.dumps(content).encode())
+    path.write_bytes(data[:8] + b"".join(blocks) + record + struct.pack("<Q", len(record)) + data[:8])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"scene_ids": ["a"]}, "units has not one value for each of 1 scenes"),
+        ({"scene_ids": ["a", 7]}, r"scene_ids\[1\] is 7"),
+        ({"scene_ids": ["a", "two\nlines"]}, r"scenario_id is 'two\\nlines'; must be text"),
+        ({"sizes": [5, -5]}, r"sizes\[1\] is -5"),
+        ({"sizes": [5, 6]}, "sizes are not those of the scenes"),
+        ({"num_agents": [2**80, 1]}, r"num_agents\[0\] is 1208\d+"),
+        ({"units": [["made", 0, 0], ["made", 1]]}, r"units\[0\] is \["),
+        ({"lacks": None}, "lacks is None"),
+        ({"card": {"scenes": 1}}, r"card\['scenes'\] is 1"),
+    ],
+)
+def test_a_record_of_wrong_values_is_named(store: SceneStore, changes: dict, message: str) -> None:
+    rewrite(store.folders[0] / "00000.scenes", **changes)
+    with pytest.raises(SceneError, match=rf"00000\.scenes: (damaged \()?{message}"):
+        SceneStore(*store.folders)
+
+
+def test_a_record_that_is_nested_without_end_is_named(store: SceneStore) -> None:
+    path = store.folders[0] / "00000.scenes"
+    record = zstandard.compress(b"[" * 100_000)
+    path.write_bytes(path.read_bytes()[:8] + record + struct.pack("<Q", len(record)) + path.read_bytes()[:8])
+    with pytest.raises(SceneError, match=r"00000\.scenes: damaged .*recursion"):
+        SceneStore(*store.folders)
+
+
+def other_count(table: int, count: int) -> Callable[[bytes], bytes]:
+    return lambda data: data[: 4 * table] + struct.pack("<I", count) + data[4 * table + 4 :]
+
+
+def empty_agents(data: bytes) -> bytes:
+    """A scene of agents that are never valid: few bytes, and gigabytes if they were unpacked."""
+    count = 6_000_000
+    return struct.pack("<9I", 1, count, *[0] * 7) + bytes(32 + count * (12 + 8 + 8) + -(-count * 91 // 8) + count // 4)
+
+
+def lights_without_listings(data: bytes) -> bytes:
+    return struct.pack("<9I", 1, *[0] * 5, 1, 0, 0) + bytes(32 + 8)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (other_count(1, 2**32 - 1), "bytes where its header asks for"),
+        (empty_agents, "claims 6000000 agents; at most 100000"),
+        (lights_without_listings, "has 0 listings of 1 lights"),
+        (lambda data: data[:-3] + b"\xff\xff\xff", "an id that is no text"),
+        (lambda data: data[:-1] + b"?", r"it holds the scene 'straight_road_3_Non\?' instead"),
+    ],
+)
+def test_a_block_that_does_not_fit_itself_is_named(store: SceneStore, change: Callable, message: str) -> None:
+    rewrite(store.folders[0] / "00000.scenes", change)
+    changed = SceneStore(*store.folders)
+    with pytest.raises(SceneError, match=rf"00000\.scenes, scene 0 \(straight_road_3_None\): .*{message}"):
+        changed[0]
+    assert_same(changed[1], red_light())
+
+
+def test_verify_names_the_file_and_the_scene_that_is_not_valid(store: SceneStore) -> None:
+    path = store.folders[0] / "00000.scenes"
+    rewrite(path, lambda data: data[:36] + b"\xff" * 24 + data[60:])  # the origin becomes NaN
+    entries = json.loads((store.folders[0] / "manifest.json").read_text())["shards"]
+    entries[0]["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
+    change_json(store.folders[0] / "manifest.json", shards=entries)
+    with pytest.raises(SceneError, match=r"00000\.scenes, scene 0 \(scene straight_road_3_None\): the origin is \[nan"):
+        SceneStore(*store.folders).verify()
 
 
 def test_a_missing_shard_or_store_is_refused(store: SceneStore) -> None:

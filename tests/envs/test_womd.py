@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from envs.scene import AgentKind, LightState, LinkKind, MapKind, Scene, SceneError
+from envs.sources import recording, womd
 from envs.sources.scenario import Scenario
 from envs.sources.tfrecord import frame, masked_crc
 from envs.sources.womd import METRES_PER_SECOND_PER_MPH, WOMD, read_womd
@@ -259,10 +260,14 @@ def cut_to_history(scenario: object) -> None:
 
 
 BROKEN = {
-    "NaN": (break_track("center_x", float("nan")), "track 101 has position nan"),
-    "infinite heading": (break_track("heading", float("inf")), "track 101 has heading inf"),
-    "SDC nowhere": (lambda s: setattr(s.tracks[0].states[10], "center_y", float("nan")), "SDC's position"),
+    "NaN": (break_track("center_x", float("nan")), r"tracks\[1\].states\[12\].center_x is nan"),
+    "infinite heading": (break_track("heading", float("inf")), r"tracks\[1\].states\[12\].heading is inf"),
+    "SDC nowhere": (
+        lambda s: setattr(s.tracks[0].states[10], "center_y", float("nan")),
+        r"tracks\[0\].states\[10\].center_y",
+    ),
     "no road edge": (lambda s: s.map_features.pop(1), "no road edge"),
+    "beyond the Earth": (break_track("center_y", -1e308), r"tracks\[1\].states\[12\].center_y is -1e\+308"),
     "no SDC": (lambda s: s.ClearField("sdc_track_index"), "SDC is track -1 of 2"),
     "SDC out of range": (lambda s: setattr(s, "sdc_track_index", 2), "SDC is track 2 of 2"),
     "SDC not there": (lambda s: setattr(s.tracks[0].states[10], "valid", False), "SDC is not valid"),
@@ -346,10 +351,75 @@ def test_what_the_format_does_not_know_is_counted_and_not_dropped_silently(make_
     }
 
 
+def test_unknown_fields_by_the_million_are_told_as_one(make_scenario, tmp_path: Path) -> None:
+    path = tmp_path / "new.tfrecord"
+    path.write_bytes(frame(make_scenario().SerializeToString() + bytes([0x98, 0x06, 0x01]) * 400_000))
+    notes: Counter[str] = Counter()
+    assert len(list(WOMD.scenes(str(path), notes))) == 1
+    assert notes == {"unknown field (megabytes of them), left out": 1}
+
+
 def test_cut_gzip_is_refused(make_scenario, tmp_path: Path) -> None:
     path = tmp_path / "cut.tfrecord.gz"
     path.write_bytes(gzip.compress(frame(make_scenario().SerializeToString()))[:-20])
     with pytest.raises(SceneError, match="cannot be unpacked"):
+        list(read_womd(path))
+
+
+@pytest.mark.parametrize("damage", [lambda data: data[:-20], lambda data: data[:40] + b"xxxx" + data[44:]])
+def test_a_damaged_bare_proto_in_gzip_is_named(make_scenario, tmp_path: Path, damage) -> None:
+    path = tmp_path / "cut.pb.gz"
+    path.write_bytes(damage(gzip.compress(make_scenario().SerializeToString())))
+    with pytest.raises(SceneError, match=r"cut\.pb\.gz, record 0: cannot be unpacked"):
+        list(read_womd(path))
+
+
+@pytest.mark.parametrize("text", [b"\xff\xfe", b"two\nlines", b"x" * 201, "\u202e".encode()])
+def test_an_id_that_is_no_printable_text_is_refused(make_scenario, tmp_path: Path, text: bytes) -> None:
+    unnamed = make_scenario()
+    unnamed.ClearField("scenario_id")
+    path = tmp_path / "bad.tfrecord"
+    path.write_bytes(frame(unnamed.SerializeToString() + b"\x2a" + varint_bytes(len(text)) + text))
+    with pytest.raises(SceneError, match=r"bad\.tfrecord, record 0: scenario_id is .*; must be text of at most 200"):
+        list(read_womd(path))
+
+
+def varint_bytes(value: int) -> bytes:
+    return bytes([value]) if value < 128 else bytes([value & 127 | 128, value >> 7])
+
+
+def add_lane_points(scenario: object, count: int) -> None:
+    scenario.map_features[0].lane.MergeFromString(b"\x42\x00" * count)  # an empty point takes two bytes
+
+
+CLAIMS = {
+    "track to predict": lambda s: s.MergeFromString(b"\x5a\x00" * 10_001),
+    "map feature": lambda s: s.MergeFromString(b"\x42\x00" * 100_001),
+    "point of the map": lambda s: add_lane_points(s, 1_000_001),
+    "light listing": lambda s: s.dynamic_map_states[0].MergeFromString(b"\x0a\x00" * 100_001),
+    "link": lambda s: s.map_features[0].lane.exit_lanes.extend([1] * 500_001),
+}
+
+
+@pytest.mark.parametrize("what", ["track", *CLAIMS])
+def test_counts_that_no_scene_has_are_refused_before_anything_is_built(
+    make_scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    scenario = make_scenario(num_tracks=3)
+    monkeypatch.setitem(recording.MOST, "track", 2 if what == "track" else 3)
+    CLAIMS.get(what, lambda scenario: None)(scenario)
+    path = tmp_path / "huge.tfrecord"
+    path.write_bytes(frame(scenario.SerializeToString()))
+    monkeypatch.setattr(womd, "_state", lambda _: pytest.fail("it was built"))
+    with pytest.raises(SceneError, match=rf"huge\.tfrecord, record 0 .*: it has \d+ times a {what}; at most"):
+        list(read_womd(path))
+
+
+def test_a_bare_proto_beyond_the_limit_is_refused_and_not_cut(make_scenario, tmp_path: Path, monkeypatch) -> None:
+    path = tmp_path / "large.pb"
+    path.write_bytes(make_scenario().SerializeToString())
+    monkeypatch.setattr(womd, "MAX_PAYLOAD", 100)
+    with pytest.raises(SceneError, match=r"large\.pb, record 0: has more than 100 bytes"):
         list(read_womd(path))
 
 
