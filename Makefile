@@ -29,7 +29,7 @@ $(BIN)/python:
 
 $(STAMP): pyproject.toml constraints.txt | $(BIN)/python
 	@echo "installing into $(VENV); the first time takes minutes"
-	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[sumo,argoverse,video,dev]'
+	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[sumo,argoverse,video,ray,dev]'
 	@touch $@
 
 lint: env ## style, spelling and who may import whom
