@@ -215,7 +215,8 @@ def _scene(arrays: dict[str, np.ndarray], scene_id: str) -> Scene:
 
 def _spread(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """States at their places, zero elsewhere; a state is moved as one item, which is far faster than by its numbers."""
-    item = np.dtype((np.void, states.dtype.itemsize * math.prod(states.shape[1:])))
+    width = math.prod(states.shape[1:])
+    item = np.dtype((np.void, states.dtype.itemsize * width))
     filled = np.zeros(valid.size, item)
-    filled[np.flatnonzero(valid)] = np.ascontiguousarray(states).reshape(len(states), -1).view(item)[:, 0]
+    filled[np.flatnonzero(valid)] = np.ascontiguousarray(states).reshape(len(states), width).view(item)[:, 0]
     return filled.view(states.dtype).reshape(valid.shape + states.shape[1:])

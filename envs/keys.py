@@ -46,6 +46,8 @@ TOKEN: NestedKey = (AGENTS, "token")
 """``[B, A]`` int64: the motion token that an action came from."""
 LOG_PROB: NestedKey = (AGENTS, "log_prob")
 """``[B, A]``: log-probability of the token under the whole model (temperature 1, nothing cut) [nats]."""
+SAMPLING_LOG_PROB: NestedKey = (AGENTS, "sampling_log_prob")
+"""``[B, A]``: log-probability of the token under the distribution that it was drawn from [nats]."""
 
 # --- what a step gives back -----------------------------------------------------------------------------------------
 REWARD: NestedKey = (AGENTS, "reward")

@@ -36,7 +36,7 @@ SUFFIX = ".scenes"
 PARTIAL_PREFIX = ".partial-"
 """Files that are being written; left over only by a process that was killed."""
 
-MAX_RECORD = 1 << 25
+MAX_RECORD = 1 << 23
 """Bytes of an unpacked record: that of 256 scenes has about 50,000, and decoded JSON can take forty times its size."""
 MAX_JSON = 1 << 27
 """Bytes of a manifest; one that lists a hundred thousand bad inputs has about 2^25."""

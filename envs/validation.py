@@ -76,8 +76,8 @@ def check_scene_id(scene_id: object, name: str) -> None:
         SceneError: it is none.
     """
     if not isinstance(scene_id, str) or len(scene_id) > LONGEST_ID or not scene_id.isprintable():
-        start = ascii(scene_id[:40] if isinstance(scene_id, str | bytes) else scene_id)
-        raise SceneError(f"{name}: scenario_id is {start}; must be text of at most {LONGEST_ID} printable letters.")
+        shown = ascii(scene_id[:40] if isinstance(scene_id, str | bytes) else scene_id)[:200]
+        raise SceneError(f"{name}: scenario_id is {shown}; must be text of at most {LONGEST_ID} printable letters.")
 
 
 def _field(scene: Scene, name: str) -> Tensor:

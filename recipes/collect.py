@@ -9,15 +9,17 @@ Run the same command again to go on after a kill.
 from __future__ import annotations
 
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import hydra
 from omegaconf import DictConfig
 
+from dpa.policy import Decoding
 from dpa.preferences import PreferenceStore, PreferenceWriter, Provenance, data_card
 from dpa.ranking import PreferenceDistance
 from dpa.ranking.transform import RankRollouts
-from dpa.rollout import Decoding, collect_groups
+from dpa.rollout import Workers, make_collector
 from envs import keys
 from envs.progress import progress
 from envs.store import SceneStore
@@ -52,17 +54,17 @@ def collect(cfg: DictConfig, scenes: SceneStore, policy: Path, seed: int, folder
     with PreferenceWriter(folder, provenance, chunk_scenes=options.chunk_scenes) as writer:
         done = writer.scenes_done
         with progress(total=len(scenes), description="collect", initial=len(done), unit="scene") as bar:
-            for groups in collect_groups(
+            for groups in make_collector(
                 scenes,
                 model,
-                range(len(scenes)),
                 num_rollouts=options.num_rollouts,
                 done=done,
                 decoding=build(Decoding, options.decoding, "collection.decoding"),
                 options=context,
                 seed=seed,
-                make_postproc=lambda part: RankRollouts(part, options.num_rollouts, distance),
-                max_rows=options.max_rows,
+                make_postproc=partial(RankRollouts, num_rollouts=options.num_rollouts, distance=distance),
+                workers=build(Workers, options.workers, "collection.workers"),
+                memory=options.memory,
                 device=cfg.device,
             ):
                 groups = groups[[scene not in done for scene in groups[keys.SCENE].tolist()]]

@@ -16,10 +16,11 @@ import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 
+from dpa.policy import Decoding
 from dpa.ranking import PreferenceDistance
 from dpa.realism import RealismResult, mean_result, realism
 from dpa.realism.submission import SubmissionWriter, plan_submission
-from dpa.rollout import Decoding, collect_groups, lifted, simulated_poses
+from dpa.rollout import lifted, make_collector, simulated_poses
 from envs import keys
 from envs.progress import progress
 from envs.scene import CURRENT_STEP, SceneSource
@@ -90,16 +91,15 @@ def evaluate(
     ready = frozenset(scored) if submission is None else submission.done & scored.keys()
     bar = progress(total=len(scenes), description=f"evaluate top-p {top_p:g}", initial=len(ready), unit="scene")
     with bar, submission or nullcontext():
-        for batch in collect_groups(
+        for batch in make_collector(
             scenes,
             model,
-            range(len(scenes)),
             num_rollouts=options.num_rollouts,
             done=ready,
             decoding=Decoding(top_p, options.temperature),
             options=context,
             seed=seed,
-            max_rows=options.max_rows,
+            memory=options.memory,
             device=cfg.device,
         ):
             fresh = score_group(batch, scenes, distance, options, bar.update, submission)

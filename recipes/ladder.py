@@ -19,10 +19,10 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from dpa.policy import ContextOptions, MotionLM
+from dpa.policy import ContextOptions, Decoding, MotionLM
 from dpa.realism import realism
 from dpa.report.statistics import summary
-from dpa.rollout import Decoding, collect_groups, lifted, simulated_poses
+from dpa.rollout import lifted, make_collector, simulated_poses
 from dpa.tokens import MotionTokenizer
 from dpa.training.seeding import seed_everything
 from envs import keys
@@ -124,15 +124,14 @@ def driven(
     scenes: SceneSource, model: MotionLM, context: ContextOptions, cfg: DictConfig
 ) -> Iterator[tuple[int, Tensor]]:
     """Rollouts of every scene by a model."""
-    batches = collect_groups(
+    batches = make_collector(
         scenes,
         model,
-        range(len(scenes)),
         num_rollouts=cfg.evaluation.num_rollouts,
         decoding=build(Decoding, cfg.decoding, "decoding"),
         options=context,
         seed=cfg.seed,
-        max_rows=cfg.evaluation.max_rows,
+        memory=cfg.evaluation.memory,
         device=cfg.device,
     )
     for batch in batches:

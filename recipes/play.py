@@ -12,9 +12,10 @@ import hydra
 import torch
 from omegaconf import DictConfig
 
+from dpa.policy import Decoding
 from dpa.report.page import write_rollouts
 from dpa.report.player import PlayerScene
-from dpa.rollout import Decoding, collect_groups, simulated_poses
+from dpa.rollout import make_collector, simulated_poses
 from envs import keys
 from envs.store import SceneStore
 from recipes.cli import CONFIG, build, recipe
@@ -46,11 +47,11 @@ def roll_out(
     rollouts: dict[int, dict[str, torch.Tensor]] = {index: {} for index in wanted}
     for name, path in policies.items():
         model, context, _ = open_policy(path, device)
-        batches = collect_groups(
+        batches = make_collector(
             scenes,
             model,
-            wanted,
             num_rollouts=num_rollouts,
+            indices=wanted,
             decoding=decoding,
             options=context,
             seed=seed,

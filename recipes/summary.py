@@ -11,11 +11,11 @@ from typing import Any
 
 from omegaconf import DictConfig
 
+from dpa.policy import Decoding
 from dpa.report.figures import plot_comparison, plot_curves, plot_scenes, read_curves
 from dpa.report.page import Picture, write_page
 from dpa.report.statistics import compare_methods
 from dpa.report.table import REFERENCE
-from dpa.rollout import Decoding
 from recipes.cli import plain, write_json
 from recipes.play import roll_out
 from recipes.scenes import Splits

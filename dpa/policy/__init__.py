@@ -3,10 +3,12 @@
 from dpa.policy.actor import MotionActor
 from dpa.policy.context import ContextOptions, SceneContext, collate_contexts, make_context
 from dpa.policy.motionlm import SIZES, MotionLM, MotionLMConfig
+from dpa.policy.sampling import Decoding
 
 __all__ = [
     "SIZES",
     "ContextOptions",
+    "Decoding",
     "MotionActor",
     "MotionLM",
     "MotionLMConfig",

@@ -11,6 +11,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from dpa.policy.context import AGENT_FIELDS, ContextOptions, SceneContext, collate_contexts, make_context
 from dpa.policy.decoder import NodeCache, NodeInputs, SceneMemory
 from dpa.policy.motionlm import MotionLM
+from dpa.policy.sampling import Decoding, draw, rollout_noise
 from envs import keys
 from envs.scene import SceneSource
 
@@ -24,21 +25,30 @@ class Contexts:
 
     Examples:
         >>> from envs.sources.synthetic import straight_road
-        >>> len(Contexts([straight_road(2)]))
-        1
+        >>> contexts = Contexts([straight_road(2)])
+        >>> len(contexts), contexts.scene_id(0)
+        (1, 'straight_road_2_None')
     """
 
     def __init__(self, scenes: SceneSource, options: ContextOptions | None = None) -> None:
         self.scenes = scenes
         self.options = options or ContextOptions()
-        self._made: dict[int, SceneContext] = {}
+        self._made: dict[int, tuple[SceneContext, str]] = {}
 
     def __len__(self) -> int:
         return len(self.scenes)
 
     def __getitem__(self, index: int) -> SceneContext:
+        return self._entry(index)[0]
+
+    def scene_id(self, index: int) -> str:
+        """The id of a scene."""
+        return self._entry(index)[1]
+
+    def _entry(self, index: int) -> tuple[SceneContext, str]:
         if index not in self._made:
-            self._made[index] = make_context(self.scenes[index], self.options)
+            scene = self.scenes[index]
+            self._made[index] = make_context(scene, self.options), scene.scene_id
         return self._made[index]
 
 
@@ -48,20 +58,22 @@ class MotionActor(TensorDictModuleBase):
     A scene is encoded once, when an episode of it starts, and shared by its K rows; keys and values of the decisions
     taken are kept between calls. Rows may stand at different decisions.
 
+    A rollout is decided by the scene's id, its number k among the scene's rollouts and the seed: not by the batch that
+    it is part of, up to the rounding of the logits (about 1e-6), which can turn a draw that falls between two tokens.
+    When a rollout is begun again, it comes out anew.
+
     Args:
         model: the distribution.
         contexts: of the scenes that the environment's ``scene`` index points to.
 
     Keyword Args:
         num_rollouts: K, contiguous rows that share a scene.
-        top_p: sample from the smallest set of tokens with at least this probability (nucleus).
-        temperature: divides the logits before ``top_p``.
+        decoding: the distribution that tokens are drawn from; that of the model by default.
         seed: of the sampling.
+        first_rollout: number of the first of the K rollouts, where others roll out the ones before.
 
-    Raises:
-        ValueError: ``top_p`` outside (0, 1] or a temperature that is not positive.
-
-    The written log-probability is that of the model itself, before temperature and ``top_p``.
+    ``log_prob`` is that of the model itself, ``sampling_log_prob`` that of the distribution drawn from (0 for the most
+    probable token, which ``ExplorationType.DETERMINISTIC`` takes).
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -81,32 +93,29 @@ class MotionActor(TensorDictModuleBase):
         contexts: Contexts,
         *,
         num_rollouts: int = 1,
-        top_p: float = 1.0,
-        temperature: float = 1.0,
+        decoding: Decoding | None = None,
         seed: int = 0,
+        first_rollout: int = 0,
     ) -> None:
         super().__init__()
-        if not 0 < top_p <= 1:
-            raise ValueError(f"top_p must lie in (0, 1], got {top_p}.")
-        if temperature <= 0:
-            raise ValueError(f"temperature must be positive, got {temperature}.")
         self.in_keys = [keys.SCENE, keys.STEP, keys.RECENT, keys.VALID, keys.CONTROLLED, keys.KIND]
-        self.out_keys = [keys.TOKEN, keys.LOG_PROB]
+        self.out_keys = [keys.TOKEN, keys.LOG_PROB, keys.SAMPLING_LOG_PROB]
         self.model, self.contexts = model, contexts
-        self.num_rollouts, self.top_p, self.temperature = num_rollouts, top_p, temperature
-        self.seed = seed
-        self._generators: dict[torch.device, torch.Generator] = {}
+        self.num_rollouts, self.first_rollout = num_rollouts, first_rollout
+        self.decoding = decoding or Decoding(top_p=1.0)
         self._memory: SceneMemory | None = None
         self._cache: NodeCache | None = None
+        self.set_seed(seed)
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write a token for every agent and its log-probability."""
-        logits = self.logits(tensordict)
-        token = self._sample(logits)
+        """Write a token for every agent and its log-probabilities."""
+        logits = self.logits(tensordict).float()
+        token, sampling = self._sample(logits, tensordict[keys.STEP][:, 0])
         self._last = token
         tensordict[keys.TOKEN] = token
         tensordict[keys.LOG_PROB] = logits.log_softmax(-1).gather(-1, token[..., None])[..., 0]
+        tensordict[keys.SAMPLING_LOG_PROB] = sampling
         return tensordict
 
     def logits(self, tensordict: TensorDictBase) -> Tensor:
@@ -120,63 +129,69 @@ class MotionActor(TensorDictModuleBase):
         nodes = NodeInputs(recent, last, step[:, None].expand_as(last), tensordict[keys.KIND], valid)
         return self.model.decoder(nodes, self._memory, masks, self._cache)
 
+    def set_seed(self, seed: int) -> None:
+        """Seed the sampling anew: the rollouts that begin from now on are the first ones of this seed."""
+        self.seed = seed
+        self._begun: dict[tuple[int, int], int] = {}
+
+    # --- the start of episodes --------------------------------------------------------------------------------------
     def _start(self, scene: Tensor, step: Tensor, shape: torch.Size) -> None:
-        """Encode the scenes of which an episode starts."""
-        batch, agents = shape
-        if batch % self.num_rollouts:
-            raise ValueError(f"num_rollouts must divide the batch of {batch} rows, got {self.num_rollouts}.")
-        fresh = (step == 0).view(-1, self.num_rollouts).any(-1)
-        if not fresh.any():
+        """Encode the scenes of which an episode starts, and draw the numbers that decide the rollouts that do."""
+        if shape[0] % self.num_rollouts:
+            raise ValueError(f"num_rollouts must divide the batch of {shape[0]} rows, got {self.num_rollouts}.")
+        begins = step == 0
+        if (step == 1).any():
+            self._count(scene, step)
+        if not begins.any():
             return
-        if self._cache is None or self._last.shape != shape or fresh.all():
-            config = self.model.config
-            dim = config.width // config.heads
-            like = self.model.decoder.head.weight
-            size = (batch, config.heads, config.horizon, agents)
-            self._cache = NodeCache(config.decoder_layers, size, dim, like)
-            self._last = torch.full(shape, self.model.no_token, device=step.device)
-            fresh = torch.ones_like(fresh)
+        if self._cache is None or self._last.shape != shape or begins.all():
+            self._allocate(shape, step.device)
+            begins = torch.ones_like(begins)
             self._scenes = scene.view(-1, self.num_rollouts)[:, 0].clone()
+        fresh = begins.view(-1, self.num_rollouts).any(-1)
         # Padding depends on the scenes of a batch, so a change of some encodes all: rare, and cheap beside the episode.
         self._scenes[fresh] = scene.view(-1, self.num_rollouts)[:, 0][fresh]
         context = collate_contexts([self.contexts[i] for i in self._scenes.tolist()]).to(step.device)
-        self._memory = self.model.encode(pad_context(context, agents))
+        self._memory = self.model.encode(pad_context(context, shape[1]))
+        self._draw_noise(begins.nonzero()[:, 0].tolist(), scene.tolist())
 
-    def _sample(self, logits: Tensor) -> Tensor:
+    def _allocate(self, shape: torch.Size, device: torch.device) -> None:
+        """Buffers for B rows of A agents; those of the episodes before serve again."""
+        config = self.model.config
+        size = (shape[0], config.heads, config.horizon, shape[1])
+        if self._cache is None or self._cache.shape != size:
+            like = self.model.decoder.head.weight
+            self._cache = NodeCache(config.decoder_layers, size, config.width // config.heads, like)
+        self._cache.clear()
+        self._last = torch.full(shape, self.model.no_token, device=device)
+        self._noise = torch.zeros(shape[0], config.horizon, shape[1])
+
+    def _count(self, scene: Tensor, step: Tensor) -> None:
+        """An episode has begun when it takes its second decision: a collector may try a policy out on the first one."""
+        for row in (step == 1).nonzero()[:, 0].tolist():
+            named = (int(scene[row]), self.first_rollout + row % self.num_rollouts)
+            self._begun[named] = self._begun.get(named, 0) + 1
+
+    def _draw_noise(self, rows: list[int], scene: list[int]) -> None:
+        horizon = self.model.config.horizon
+        for row in rows:
+            rollout = self.first_rollout + row % self.num_rollouts
+            episode = self._begun.get((scene[row], rollout), 0)
+            agents = len(self.contexts[scene[row]].kind)
+            scene_id = self.contexts.scene_id(scene[row])
+            self._noise[row, :, :agents] = rollout_noise(self.seed, scene_id, rollout, episode, (horizon, agents))
+        self._noise_there = self._noise.to(self._last.device, non_blocking=True)
+
+    # --- sampling ---------------------------------------------------------------------------------------------------
+    def _sample(self, logits: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
+        """Tokens ``[B, A]`` and the log-probabilities by which they were drawn."""
         if exploration_type() is ExplorationType.DETERMINISTIC:
-            return logits.argmax(-1)
-        probs = nucleus((logits / self.temperature).softmax(-1), self.top_p)
-        return probs.flatten(0, -2).multinomial(1, generator=self._generator(logits.device)).view(probs.shape[:-1])
-
-    def _generator(self, device: torch.device) -> torch.Generator:
-        if device not in self._generators:
-            self._generators[device] = torch.Generator(device).manual_seed(self.seed)
-        return self._generators[device]
-
-    def set_seed(self, seed: int) -> None:
-        """Seed the sampling anew."""
-        self.seed = seed
-        self._generators.clear()
-
-
-def nucleus(probs: Tensor, top_p: float) -> Tensor:
-    """Keep the most probable tokens that together reach ``top_p``, renormalised.
-
-    Args:
-        probs: ``[..., V]``.
-        top_p: in (0, 1].
-
-    Examples:
-        >>> nucleus(torch.tensor([0.5, 0.3, 0.2]), 0.6)
-        tensor([0.6250, 0.3750, 0.0000])
-    """
-    if top_p >= 1:
-        return probs
-    ordered, index = probs.sort(-1, descending=True)
-    # A token is kept when those before it have not reached top_p yet; the first one always is.
-    kept = ordered * (ordered.cumsum(-1) - ordered < top_p)
-    kept = torch.zeros_like(probs).scatter(-1, index, kept)
-    return kept / kept.sum(-1, keepdim=True)
+            token = logits.argmax(-1)
+            return token, torch.zeros_like(logits[..., 0])
+        log_probs = self.decoding.log_probs(logits)
+        uniform = self._noise_there[torch.arange(len(step), device=step.device), step]
+        token = draw(log_probs, uniform)
+        return token, log_probs.gather(-1, token[..., None])[..., 0]
 
 
 def pad_context(context: SceneContext, agents: int) -> SceneContext:

@@ -200,10 +200,15 @@ class NodeCache:
     """
 
     def __init__(self, layers: int, shape: tuple[int, int, int, int], dim: int, like: Tensor) -> None:
+        self.shape = shape
         self.keys = [like.new_zeros(*shape, dim + 3) for _ in range(layers)]
         self.values = [like.new_zeros(*shape, dim + 3) for _ in range(layers)]
         batch, _, horizon, agents = shape
         self.valid = torch.zeros(batch, horizon, agents, dtype=torch.bool, device=like.device)
+
+    def clear(self) -> None:
+        """Forget all nodes: what is in the buffers is not looked at any more."""
+        self.valid.zero_()
 
     def start(self, step: Tensor, valid: Tensor) -> NodeMasks:
         """Begin a decision and get its masks: each row sees the nodes up to its own decision.

@@ -303,12 +303,17 @@ def lights_without_listings(data: bytes) -> bytes:
     return struct.pack("<9I", 1, *[0] * 5, 1, 0, 0) + bytes(32 + 8)
 
 
+def nothing_at_all(data: bytes) -> bytes:
+    return struct.pack("<9I", 1, *[0] * 8) + bytes(32)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (other_count(1, 2**32 - 1), "bytes where its header asks for"),
         (empty_agents, "claims 6000000 agents; at most 100000"),
         (lights_without_listings, "has 0 listings of 1 lights"),
+        (nothing_at_all, "it holds the scene '' instead"),
         (lambda data: data[:-3] + b"\xff\xff\xff", "an id that is no text"),
         (lambda data: data[:-1] + b"?", r"it holds the scene 'straight_road_3_Non\?' instead"),
     ],

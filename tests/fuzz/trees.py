@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from copy import deepcopy
 from random import Random
 from typing import Any
 
@@ -78,7 +79,7 @@ def _place(tree: Any, r: Random) -> tuple[Any, Any]:
 
 def _value(broken: Broken, r: Random) -> Any:
     texts = r.choices((RAW, NO_JSON, None), (6, 1, 12))[0]
-    return broken.raw(r.choice(texts)) if texts else r.choice(VALUES)
+    return broken.raw(r.choice(texts)) if texts else deepcopy(r.choice(VALUES))  # edits may go into it
 
 
 def _replace(broken: Broken, parent: Any, key: Any, r: Random) -> None:

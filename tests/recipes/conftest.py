@@ -34,14 +34,14 @@ TINY = [
     "pretraining.checkpoint_interval=2",
     "collection.num_rollouts=4",
     "collection.chunk_scenes=2",
-    "collection.max_rows=24",
+    "collection.memory=0.001",
     "collection.ranking.stride=5",
     "alignment.steps=4",
     "alignment.warmup=1",
     "alignment.scenes_per_step=2",
     "alignment.checkpoint_interval=2",
     "evaluation.num_rollouts=4",
-    "evaluation.max_rows=24",
+    "evaluation.memory=0.001",
 ]
 """Options that make every stage take seconds; each recipe takes those of its own sections."""
 SECTIONS = {

@@ -18,9 +18,9 @@ pytestmark = pytest.mark.slow
 
 LONG = {
     "pretrain": ["pretraining.steps=60", "pretraining.checkpoint_interval=5"],
-    "collect": ["collection.num_rollouts=24", "collection.max_rows=1", "collection.ranking.stride=1"],
+    "collect": ["collection.num_rollouts=24", "collection.memory=1e-4", "collection.ranking.stride=1"],
     "align": ["alignment.steps=60", "alignment.checkpoint_interval=5", "method.data.num=2"],
-    "evaluate": ["evaluation.num_rollouts=24", "evaluation.max_rows=1", "split=train"],
+    "evaluate": ["evaluation.num_rollouts=24", "evaluation.memory=1e-4", "split=train"],
 }
 """Options that give a kill something to interrupt; stages in the order in which they need each other."""
 

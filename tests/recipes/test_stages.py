@@ -116,7 +116,7 @@ def test_collecting_goes_on_where_it_stopped_even_inside_a_group(
     command = collect_into(tmp_path / "preferences", runs, options)
     import recipes.collect as collecting
 
-    whole = collecting.collect_groups
+    whole = collecting.make_collector
 
     def stop_after_two(*args: object, **kwargs: object) -> Iterator:
         for number, batch in enumerate(whole(*args, **kwargs)):
@@ -125,7 +125,7 @@ def test_collecting_goes_on_where_it_stopped_even_inside_a_group(
             yield batch
 
     with monkeypatch.context() as patch:
-        patch.setattr(collecting, "collect_groups", stop_after_two)
+        patch.setattr(collecting, "make_collector", stop_after_two)
         patch.setattr(
             collecting.PreferenceWriter, "__exit__", lambda writer, *_: writer._lock.close()
         )  # as a kill does
@@ -327,7 +327,7 @@ def test_an_evaluation_writes_a_submission_that_is_valid_and_scores_the_same(
     archive, result = tmp_path / "mine.tar.gz", tmp_path / "result.json"
     command = options(
         "evaluate", f"policy={runs / 'reference/policy.pt'}", f"json={result}", "evaluation.num_rollouts=32",
-        "evaluation.max_rows=200", f"submission={archive}", f"submission_metadata={tmp_path / 'me.yaml'}",
+        "evaluation.memory=0.005", f"submission={archive}", f"submission_metadata={tmp_path / 'me.yaml'}",
     )  # fmt: skip
     outcome = run("evaluate", *command)
     assert outcome.status == 0, outcome.err

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from dpa.policy import ContextOptions, MotionActor, MotionLM, collate_contexts
-from dpa.policy.actor import Contexts, nucleus, pad_context
+from dpa.policy.actor import Contexts, pad_context
+from dpa.policy.sampling import Decoding
 from dpa.tokens import TokenAction
 from envs import keys
 from envs.scene import Scene
@@ -31,7 +31,7 @@ def scenes(scene: Callable[..., Scene]) -> list[Scene]:
     return [scene(4, seed=1), scene(2, seed=2), scene(6, seed=3)]
 
 
-def drive(model: MotionLM, scenes: list[Scene], **options: float) -> tuple[TransformedEnv, MotionActor]:
+def drive(model: MotionLM, scenes: list[Scene], **options: Any) -> tuple[TransformedEnv, MotionActor]:
     """Environment and actor of two scenes at a time, two rollouts each."""
     env = TrafficEnv(scenes, num_scenes=2, num_rollouts=2, max_controlled=LIMIT)
     actor = MotionActor(model, Contexts(scenes, ContextOptions(max_controlled=LIMIT)), num_rollouts=2, **options)
@@ -103,7 +103,7 @@ def test_rows_may_stand_at_different_decisions(model: MotionLM, scenes: list[Sce
 def test_written_log_probs_are_those_of_the_model_whatever_was_sampled_from(
     model: MotionLM, scenes: list[Scene]
 ) -> None:
-    env, actor = drive(model, scenes, top_p=0.4, temperature=0.7)
+    env, actor = drive(model, scenes, decoding=Decoding(top_p=0.4, temperature=0.7))
     assert_as_teacher_forced(model, scenes, env.rollout(16, actor))
 
 
@@ -141,6 +141,60 @@ def test_the_deterministic_choice_is_the_most_probable_token(model: MotionLM, sc
         assert torch.equal(actor(state)[keys.TOKEN], logits.argmax(-1))
 
 
+def test_sampling_log_probs_are_those_of_the_cut_distribution(model: MotionLM, scenes: list[Scene]) -> None:
+    decoding = Decoding(top_p=0.6, temperature=0.8, top_k=20)
+    env, actor = drive(model, scenes, decoding=decoding)
+    state = env.reset()
+    logits = drive(model, scenes)[1].logits(state)
+    out = actor(state)
+    expected = decoding.log_probs(logits).gather(-1, out[keys.TOKEN][..., None])[..., 0]
+    torch.testing.assert_close(out[keys.SAMPLING_LOG_PROB], expected)
+    assert torch.isfinite(expected).all() and (expected > out[keys.LOG_PROB]).any()
+
+
+# --- a rollout depends on (scene, k, seed) --------------------------------------------------------------------------
+def tokens_of(model: MotionLM, scenes: list[Scene], order: list[int], **options: Any) -> dict[tuple[str, int], Tensor]:
+    """Tokens ``[T, A]`` of all rollouts by scene and number, of scenes rolled out together in some order."""
+    rollouts, first = options.pop("num_rollouts", 2), options.pop("first_rollout", 0)
+    chosen = [scenes[index] for index in order]
+    env = TrafficEnv(chosen, num_scenes=len(chosen), num_rollouts=rollouts, max_controlled=LIMIT, **options)
+    contexts = Contexts(chosen, ContextOptions(max_controlled=LIMIT))
+    actor = MotionActor(model, contexts, num_rollouts=rollouts, first_rollout=first, seed=7)
+    rollout = TransformedEnv(env, TokenAction(model.tokenizer)).rollout(16, actor)
+    return {
+        (scene.scene_id, first + k): rollout[row * rollouts + k][keys.TOKEN][:, : int(scene.agents.present.sum())]
+        for row, scene in enumerate(chosen)
+        for k in range(rollouts)
+    }
+
+
+@pytest.mark.parametrize(
+    ("order", "options"),
+    [
+        ([2, 0, 1], {}),  # in another order
+        ([1], {}),  # alone
+        ([0, 2], {"num_agents": 30}),  # with more padding
+        ([0, 1, 2], {"num_rollouts": 1}),  # fewer rollouts
+        ([0, 1, 2], {"num_rollouts": 1, "first_rollout": 1}),  # the others of them
+    ],
+)
+def test_a_rollout_depends_on_scene_number_and_seed_and_not_on_its_batch(
+    model: MotionLM, scenes: list[Scene], order: list[int], options: dict[str, int]
+) -> None:
+    whole = tokens_of(model, scenes, [0, 1, 2])
+    for named, tokens in tokens_of(model, scenes, order, **options).items():
+        assert torch.equal(tokens, whole[named]), named
+
+
+def test_a_rollout_that_is_begun_again_comes_out_anew(model: MotionLM, scenes: list[Scene]) -> None:
+    env = TransformedEnv(TrafficEnv(scenes[:1], num_rollouts=2), TokenAction(model.tokenizer))
+    actor = MotionActor(model, Contexts(scenes[:1]), num_rollouts=2)
+    first, second = (env.rollout(16, actor)[keys.TOKEN] for _ in range(2))
+    assert not torch.equal(first, second)
+    actor.set_seed(0)
+    assert torch.equal(env.rollout(16, actor)[keys.TOKEN], first)
+
+
 def test_a_scene_is_encoded_once_for_all_its_rollouts_and_decisions(model: MotionLM, scenes: list[Scene]) -> None:
     encoded = []
     model.encoder.register_forward_hook(lambda *_: encoded.append(1))
@@ -149,53 +203,14 @@ def test_a_scene_is_encoded_once_for_all_its_rollouts_and_decisions(model: Motio
     assert len(encoded) == 1
 
 
-# --- nucleus --------------------------------------------------------------------------------------------------------
-def nucleus_by_hand(probs: list[float], top_p: float) -> list[float]:
-    """Take the most probable tokens one by one until they hold ``top_p``."""
-    kept, total = set(), 0.0
-    for index in sorted(range(len(probs)), key=lambda i: -probs[i]):
-        kept.add(index)
-        total += probs[index]
-        if total >= top_p:
-            break
-    return [p / total if i in kept else 0.0 for i, p in enumerate(probs)]
-
-
-@settings(max_examples=50, deadline=None)
-@given(st.lists(st.floats(0.01, 10), min_size=1, max_size=8, unique=True), st.floats(0.01, 0.99))
-def test_the_nucleus_is_the_smallest_set_that_holds_top_p(weights: list[float], top_p: float) -> None:
-    probs = torch.tensor(weights, dtype=torch.float64)
-    probs = probs / probs.sum()
-    if (probs.sort(descending=True).values.cumsum(-1) - top_p).abs().min() < 1e-9:
-        return  # a tie is a matter of rounding
-    expected = torch.tensor(nucleus_by_hand(probs.tolist(), top_p), dtype=torch.float64)
-    torch.testing.assert_close(nucleus(probs, top_p), expected)
-
-
-def test_a_nucleus_of_one_is_the_whole_distribution() -> None:
-    probs = torch.tensor([0.2, 0.5, 0.3])
-    assert torch.equal(nucleus(probs, 1.0), probs)
-
-
 def test_a_tiny_nucleus_is_the_most_probable_token(model: MotionLM, scenes: list[Scene]) -> None:
-    env, actor = drive(model, scenes, top_p=1e-6)
+    env, actor = drive(model, scenes, decoding=Decoding(top_p=1e-6))
     state = env.reset()
     logits = drive(model, scenes)[1].logits(state)
     assert torch.equal(actor(state)[keys.TOKEN], logits.argmax(-1))
 
 
 # --- errors ---------------------------------------------------------------------------------------------------------
-def test_options_that_make_no_sense_are_refused(model: MotionLM) -> None:
-    contexts = Contexts([straight_road()])
-    for options, message in (
-        ({"top_p": 0.0}, r"top_p must lie in \(0, 1\], got 0.0"),
-        ({"top_p": 1.5}, "got 1.5"),
-        ({"temperature": 0.0}, "temperature must be positive, got 0.0"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            MotionActor(model, contexts, **options)
-
-
 def test_another_number_of_rollouts_than_the_environment_has_is_refused(model: MotionLM) -> None:
     scenes = [straight_road()]
     env = TransformedEnv(TrafficEnv(scenes, num_rollouts=3), TokenAction(model.tokenizer))

@@ -1,0 +1,235 @@
+"""The collector: tasks in order, whoever does them, and none lost with a worker."""
+
+from __future__ import annotations
+
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
+from heapq import heapify, heappop, heappush
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.collectors import BaseCollector
+
+from dpa.policy.context import ContextOptions
+from dpa.policy.motionlm import MotionLM
+from dpa.policy.sampling import Decoding
+from dpa.rollout.crew import Crew, Outcome, Workers, hire
+from dpa.rollout.job import PostProcess, RolloutJob
+from dpa.rollout.plan import GIB, RolloutTask, bytes_per_row, plan_tasks
+from envs.scene import SceneSource
+
+MOST_LOSSES = 3
+"""Workers that one task may cost before it is given up."""
+AHEAD = 3
+"""Tasks for each worker that may be under way or wait for their turn."""
+
+
+class RolloutCollector(BaseCollector):
+    """Whole episodes of all scenes, task by task, in the order of the tasks whoever does them.
+
+    A worker that is killed costs the task that it was at: another one does it again. Weights and seed take effect with
+    the next batch that is handed out, also where workers are ahead of it, so every crew gives the same batches.
+
+    Args:
+        job: what is rolled out.
+        tasks: see :func:`~dpa.rollout.plan.plan_tasks`.
+        workers: who does it.
+
+    Raises:
+        ChildProcessError: while iterating, when a task cost :data:`MOST_LOSSES` workers.
+
+    Iterating starts the workers; they end with the last batch, with :meth:`shutdown`, or when the loop is left.
+    """
+
+    def __init__(self, job: RolloutJob, tasks: Sequence[RolloutTask], workers: Workers | None = None) -> None:
+        super().__init__()
+        self.job, self.tasks, self.workers = job, list(tasks), workers or Workers()
+        self._next = 0
+        self._weights: Mapping[str, Tensor] | None = None
+        self._crew: Crew | None = None
+
+    def __len__(self) -> int:
+        return len(self.tasks)
+
+    def iterator(self) -> Iterator[TensorDictBase]:
+        """Batches of the tasks that are left: what the post-processing makes of ``[S * K, T]``."""
+        try:
+            self._begin()
+            while self._next < len(self.tasks):
+                while self._next not in self._made:
+                    self._feed()
+                    self._take(*self._crew.wait())
+                batch = self._made.pop(self._next)
+                self._next += 1
+                yield batch
+        finally:
+            self.shutdown()
+
+    # --- who does what ----------------------------------------------------------------------------------------------
+    def _begin(self) -> None:
+        self.shutdown()
+        self._crew = hire(self.job, self.workers)
+        if self._weights is not None:
+            self._crew.update(self._weights, self.job.seed)
+        self._waiting = list(range(self._next, len(self.tasks)))
+        self._idle = list(range(self._crew.size))
+        self._running: dict[int, tuple[int, int]] = {}
+        self._made: dict[int, TensorDictBase] = {}
+        self._lost: Counter[int] = Counter()
+        self._version = 0
+
+    def _feed(self) -> None:
+        """Give the first tasks that wait to those who have none, not too far ahead of the next batch."""
+        last = self._next + AHEAD * self._crew.size
+        while self._idle and self._waiting and self._waiting[0] < last:
+            worker, number = self._idle.pop(), heappop(self._waiting)
+            self._running[worker] = number, self._version
+            self._crew.submit(worker, self.tasks[number])
+
+    def _take(self, worker: int, outcome: Outcome) -> None:
+        number, version = self._running.pop(worker)
+        self._idle.append(worker)
+        if outcome.error is not None:
+            raise outcome.error
+        if outcome.batch is None:
+            self._lose(number)
+        elif version == self._version:
+            self._made[number] = outcome.batch
+            return
+        heappush(self._waiting, number)
+
+    def _lose(self, number: int) -> None:
+        self._lost[number] += 1
+        if self._lost[number] == MOST_LOSSES:
+            raise ChildProcessError(
+                f"{MOST_LOSSES} workers were killed over the scenes {list(self.tasks[number].scenes)[:5]}, perhaps for "
+                "want of memory; give fewer workers or a smaller budget."
+            )
+
+    def _changed(self) -> None:
+        """What was made ahead of the next batch was made with what held before: it is done again."""
+        if self._crew is None:
+            return
+        self._version += 1
+        self._waiting += self._made
+        heapify(self._waiting)
+        self._made.clear()
+        self._crew.update(self._weights, self.job.seed)
+
+    # --- TorchRL's collectors ---------------------------------------------------------------------------------------
+    def update_policy_weights_(
+        self,
+        policy_or_weights: nn.Module | TensorDictBase | Mapping[str, Tensor] | None = None,
+        **_: Any,
+    ) -> None:
+        """Drive with other weights from the next batch on.
+
+        Args:
+            policy_or_weights: the model, its weights as a tensordict or by their names in ``state_dict``; by default
+                those of the collector's own model, as they are now.
+        """
+        given = self.job.model if policy_or_weights is None else policy_or_weights
+        if isinstance(given, nn.Module):
+            given = given.state_dict()
+        elif isinstance(given, TensorDictBase):
+            given = given.flatten_keys(".").to_dict()
+        known = self.job.model.state_dict()
+        if not given.keys() <= known.keys():
+            raise ValueError(f"weights {sorted(given.keys() - known.keys())[:3]} are none of the model's.")
+        self._weights = {name: value.detach().clone() for name, value in (known | dict(given)).items()}
+        self._changed()
+
+    def set_seed(self, seed: int, static_seed: bool = False) -> int:
+        """Seed the rollouts from the next batch on; returns the seed."""
+        self.job = replace(self.job, seed=seed)
+        self._changed()
+        return seed
+
+    def state_dict(self) -> OrderedDict[str, Any]:
+        """Where the collector is."""
+        return OrderedDict(next=self._next, seed=self.job.seed)
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Go to where another collector of the same tasks was; iterate anew."""
+        self.shutdown()
+        self._next = int(state_dict["next"])
+        self.job = replace(self.job, seed=int(state_dict["seed"]))
+
+    def shutdown(self, *_: Any, **__: Any) -> None:
+        """End the workers."""
+        if self._crew is not None:
+            self._crew.close()
+            self._crew = None
+
+
+def make_collector(
+    scenes: SceneSource,
+    model: MotionLM,
+    *,
+    num_rollouts: int,
+    indices: Sequence[int] | None = None,
+    done: Collection[int] = (),
+    decoding: Decoding | None = None,
+    options: ContextOptions | None = None,
+    seed: int = 0,
+    make_postproc: Callable[[SceneSource], PostProcess] | None = None,
+    workers: Workers | None = None,
+    memory: float = 1.0,
+    device: torch.device | str = "cpu",
+) -> RolloutCollector:
+    """Roll all scenes out, each K times: a TorchRL collector, in this process, in several, or on a Ray cluster.
+
+    A rollout depends on the scene, its number and the seed. Workers, budget and what is done already change how the
+    work is cut up, and not what comes out.
+
+    Args:
+        scenes: where scenes come from.
+        model: what drives.
+
+    Keyword Args:
+        num_rollouts: K.
+        indices: scenes to roll out; all by default.
+        done: scenes that are not needed.
+        decoding: how tokens are drawn.
+        options: how scenes are cut up; also the horizon and the controlled agents.
+        seed: of the sampling.
+        make_postproc: makes the post-processing of some scenes' rollouts; it runs in the workers.
+        workers: who does it; this process by default.
+        memory: budget of each worker for rollouts [GiB]; a crowded scene is rolled out in pieces.
+        device: of environment and policy.
+
+    Examples:
+        >>> from dpa.tokens import VerletTokenizer
+        >>> from envs.sources.synthetic import straight_road
+        >>> model = MotionLM("nano", VerletTokenizer())
+        >>> for batch in make_collector([straight_road(2), straight_road(9)], model, num_rollouts=4):
+        ...     batch["scene"][:, 0].tolist(), batch["agents", "token"].shape
+        ([0, 0, 0, 0], torch.Size([4, 16, 2]))
+        ([1, 1, 1, 1], torch.Size([4, 16, 9]))
+    """
+    options = options or ContextOptions()
+    job = RolloutJob(scenes, model, num_rollouts, decoding or Decoding(), options, seed, make_postproc, device)
+    tasks = plan_tasks(agents_of(scenes, indices), num_rollouts, rows_within(memory, model, options), done)
+    return RolloutCollector(job, tasks, workers)
+
+
+def rows_within(memory: float, model: MotionLM, options: ContextOptions) -> int:
+    """Agents times rollouts that run side by side within a budget [GiB].
+
+    Raises:
+        ValueError: the budget does not hold one agent.
+    """
+    rows = int(memory * GIB) // bytes_per_row(model.config, options.max_pieces)
+    if rows < 1:
+        raise ValueError(f"memory must hold at least one agent, got {memory} GiB; give 0.1 or more.")
+    return rows
+
+
+def agents_of(scenes: SceneSource, indices: Sequence[int] | None) -> dict[int, int]:
+    """Present agents of some scenes (all by default) by index; a store knows them without loading a scene."""
+    wanted = range(len(scenes)) if indices is None else indices
+    known = getattr(scenes, "num_agents", None)
+    return {i: int(known[i] if known is not None else scenes[i].agents.present.sum()) for i in wanted}

@@ -1,0 +1,150 @@
+"""What a worker needs to know, and the worker: one TorchRL collector for each piece of a task."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.collectors import Collector
+from torchrl.envs import TransformedEnv
+
+from dpa.policy.actor import Contexts, MotionActor
+from dpa.policy.context import ContextOptions
+from dpa.policy.motionlm import MotionLM
+from dpa.policy.sampling import Decoding
+from dpa.rollout.plan import RolloutTask
+from dpa.tokens import TokenAction
+from envs import keys
+from envs.scene import Scene, SceneSource
+from envs.traffic import TrafficEnv, largest_scene
+
+PostProcess = Callable[[TensorDictBase], TensorDictBase]
+
+
+class Subset:
+    """Some scenes of a source, in the order given: a :class:`~envs.scene.SceneSource` itself. Each is loaded once.
+
+    Args:
+        scenes: the whole source.
+        indices: positions in it.
+
+    Examples:
+        >>> from envs.sources.synthetic import straight_road
+        >>> Subset([straight_road(1), straight_road(2)], [1])[0].scene_id
+        'straight_road_2_None'
+    """
+
+    def __init__(self, scenes: SceneSource, indices: Sequence[int]) -> None:
+        self.scenes, self.indices = scenes, list(indices)
+        self._loaded: dict[int, Scene] = {}
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __getitem__(self, index: int) -> Scene:
+        if index not in self._loaded:
+            self._loaded[index] = self.scenes[self.indices[index]]
+        return self._loaded[index]
+
+
+@dataclass(frozen=True)
+class RolloutJob:
+    """Everything that decides rollouts but the task at hand. It travels to the workers.
+
+    Attributes:
+        scenes: where scenes come from.
+        model: what drives.
+        num_rollouts: K.
+        decoding: how tokens are drawn.
+        options: how scenes are cut up; also the horizon and the controlled agents.
+        seed: of the sampling.
+        make_postproc: makes the post-processing of a task from its scenes, for instance
+            :class:`~dpa.ranking.RankRollouts`; applied to the whole rollouts ``[S * K, T]`` of the task.
+        device: of environment and policy.
+    """
+
+    scenes: SceneSource
+    model: MotionLM
+    num_rollouts: int
+    decoding: Decoding = field(default_factory=Decoding)
+    options: ContextOptions = field(default_factory=ContextOptions)
+    seed: int = 0
+    make_postproc: Callable[[SceneSource], PostProcess] | None = None
+    device: torch.device | str = "cpu"
+
+
+class RolloutWorker:
+    """Rolls tasks out, one after the other.
+
+    Args:
+        job: what to do with a task.
+
+    Examples:
+        >>> from dpa.tokens import VerletTokenizer
+        >>> from envs.sources.synthetic import straight_road
+        >>> job = RolloutJob([straight_road(2)], MotionLM("nano", VerletTokenizer()), num_rollouts=4)
+        >>> RolloutWorker(job).run(RolloutTask((0,), (range(0, 2), range(2, 4)))).batch_size
+        torch.Size([4, 16])
+    """
+
+    def __init__(self, job: RolloutJob) -> None:
+        self.job = job
+        self.model = job.model.to(job.device).eval()
+
+    def update(self, weights: Mapping[str, Tensor] | None, seed: int) -> None:
+        """Take over other weights (None keeps those at hand) and a seed."""
+        if weights is not None:
+            self.model.load_state_dict(weights)
+        self.job = replace(self.job, seed=seed)
+
+    def run(self, task: RolloutTask) -> TensorDictBase:
+        """The rollouts of a task, post-processed; ``scene`` holds indices into the job's source."""
+        part = Subset(self.job.scenes, task.scenes)
+        contexts = Contexts(part, self.job.options)
+        pieces = [self._piece(part, contexts, piece) for piece in task.pieces]
+        # [S * k, T] each; the rollouts of a scene must be contiguous.
+        together = [piece.unflatten(0, (len(part), len(piece) // len(part))) for piece in pieces]
+        batch = pieces[0] if len(pieces) == 1 else torch.cat(together, 1).flatten(0, 1)
+        if self.job.make_postproc is not None:
+            batch = self.job.make_postproc(part)(batch)
+        batch[keys.SCENE] = torch.tensor(task.scenes, device=batch.device)[batch[keys.SCENE]]
+        return batch
+
+    def _piece(self, part: Subset, contexts: Contexts, piece: range) -> TensorDictBase:
+        job, options = self.job, self.job.options
+        env = TrafficEnv(
+            part,
+            num_scenes=len(part),
+            num_rollouts=len(piece),
+            num_agents=largest_scene(part),
+            max_controlled=options.max_controlled,
+            decision_steps=options.decision_steps,
+            horizon=options.horizon,
+            device=job.device,
+        )
+        actor = MotionActor(
+            self.model,
+            contexts,
+            num_rollouts=len(piece),
+            decoding=job.decoding,
+            seed=job.seed,
+            first_rollout=piece.start,
+        )
+        frames = len(part) * len(piece) * options.horizon
+        collector = Collector(
+            TransformedEnv(env, TokenAction(self.model.tokenizer)),
+            actor,
+            frames_per_batch=frames,
+            total_frames=frames,
+            auto_register_policy_transforms=False,
+            track_traj_ids=False,
+            trust_policy=True,
+            device=job.device,
+        )
+        try:
+            return next(iter(collector))
+        finally:
+            collector.shutdown()

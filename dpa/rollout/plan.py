@@ -1,0 +1,91 @@
+"""Which scenes are rolled out together, and in how many pieces, so that memory keeps to a budget."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from dpa.policy.decoder import NEAREST_PIECES
+from dpa.policy.motionlm import MotionLMConfig
+from dpa.training.batches import micro_batches
+
+GIB = 1 << 30
+_COLLECTED_BYTES = 400
+"""Of one agent and decision in a collector's batch: recent poses (now and next), action, token, flags, reward."""
+_FLOAT = 4
+
+
+@dataclass(frozen=True)
+class RolloutTask:
+    """The K rollouts of some scenes: what one worker does at a time.
+
+    Attributes:
+        scenes: indices into the source; their agents are padded to the largest of them.
+        pieces: rollouts ``range(first, last)`` that run side by side, piece after piece; together ``range(K)``.
+    """
+
+    scenes: tuple[int, ...]
+    pieces: tuple[range, ...]
+
+
+def plan_tasks(
+    sizes: Mapping[int, int], num_rollouts: int, max_rows: int, done: Collection[int] = ()
+) -> list[RolloutTask]:
+    """Group scenes of similar size, so that little is padded and rows stay within a bound.
+
+    The groups depend on all scenes and not on what is done, so that an interrupted collection goes on as it would have.
+
+    Args:
+        sizes: scenes to roll out and their agents.
+        num_rollouts: K.
+        max_rows: agents times rollouts that run side by side at most; a scene that alone exceeds it is rolled out in
+            pieces, down to one rollout at a time.
+        done: scenes that are not needed; a group is left out when all its scenes are.
+
+    Raises:
+        ValueError: no rollouts, or no rows.
+
+    Examples:
+        >>> for task in plan_tasks({0: 5, 1: 30, 2: 6}, num_rollouts=4, max_rows=60):
+        ...     print(task.scenes, task.pieces)
+        (0, 2) (range(0, 4),)
+        (1,) (range(0, 2), range(2, 4))
+    """
+    if num_rollouts < 1 or max_rows < 1:
+        raise ValueError(f"num_rollouts and max_rows must be 1 or more, got {num_rollouts} and {max_rows}.")
+    ordered = list(sizes)
+    groups = micro_batches([sizes[index] * num_rollouts for index in ordered], max_rows)
+    tasks = (_task([ordered[position] for position in group], sizes, num_rollouts, max_rows) for group in groups)
+    return [task for task in tasks if not all(index in done for index in task.scenes)]
+
+
+def _task(scenes: Sequence[int], sizes: Mapping[int, int], num_rollouts: int, max_rows: int) -> RolloutTask:
+    side_by_side = max(1, min(num_rollouts, max_rows // max(1, len(scenes) * max(sizes[index] for index in scenes))))
+    return RolloutTask(tuple(scenes), tuple(_pieces(num_rollouts, side_by_side)))
+
+
+def _pieces(num_rollouts: int, most: int) -> Iterator[range]:
+    """``range(K)`` in as few pieces as will do, of equal size within one."""
+    count = -(-num_rollouts // most)
+    for piece in range(count):
+        yield range(piece * num_rollouts // count, (piece + 1) * num_rollouts // count)
+
+
+def bytes_per_row(config: MotionLMConfig, surroundings: int, itemsize: int = _FLOAT) -> int:
+    """Memory of one agent of one rollout while it runs: its cache, what a decision computes, and what is collected.
+
+    Args:
+        config: size of the model.
+        surroundings: map pieces and lights of a scene.
+        itemsize: bytes of a number in the model.
+
+    Examples:
+        >>> from dpa.policy import SIZES
+        >>> round(bytes_per_row(SIZES["paper"], surroundings=512) / 1024)
+        77
+    """
+    channels = config.width // config.heads + 3
+    cache = 2 * config.decoder_layers * config.heads * config.horizon * channels * itemsize
+    vicinity = 3 * NEAREST_PIECES * config.width * itemsize + 3 * surroundings * _FLOAT
+    layers = 4 * max(config.feed, 3 * config.width) * itemsize
+    return cache + vicinity + layers + config.horizon * _COLLECTED_BYTES

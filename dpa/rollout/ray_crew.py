@@ -1,0 +1,87 @@
+"""A crew of Ray actors: workers on any machine of a cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import ray
+import torch
+from ray.exceptions import RayActorError, RayTaskError
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from dpa.rollout.crew import Outcome, Workers
+from dpa.rollout.job import RolloutJob, RolloutWorker
+from dpa.rollout.plan import RolloutTask
+
+
+class RayCrew:
+    """Ray actors, each with its threads of CPU and, where the job runs on ``cuda``, a GPU of its own.
+
+    A cluster that runs already is used (``address``, or that of the session at hand); otherwise one is started here.
+
+    Args:
+        job: what they do. Scenes must be at the same path on every machine.
+        workers: how many.
+    """
+
+    def __init__(self, job: RolloutJob, workers: Workers) -> None:
+        if not ray.is_initialized():
+            ray.init(address=workers.address, include_dashboard=False, log_to_driver=False, logging_level="error")
+        self.size = workers.count
+        needs = {"num_cpus": workers.threads, "num_gpus": int(str(job.device).startswith("cuda"))}
+        self._hire = ray.remote(**needs, max_restarts=0)(_Hand).remote
+        self._threads = workers.threads
+        self._job = ray.put(replace(job, model=job.model.cpu(), device=str(job.device)))
+        self._latest: tuple[Any, int] = (None, job.seed)
+        self._hands = [self._start() for _ in range(self.size)]
+        self._running: dict[Any, int] = {}
+
+    def submit(self, worker: int, task: RolloutTask) -> None:
+        """See :class:`~dpa.rollout.crew.Crew`."""
+        self._running[self._hands[worker].run.remote(task)] = worker
+
+    def wait(self) -> tuple[int, Outcome]:
+        """See :class:`~dpa.rollout.crew.Crew`."""
+        (ready, *_), _ = ray.wait(list(self._running), num_returns=1)
+        worker = self._running.pop(ready)
+        try:
+            return worker, Outcome(ray.get(ready))
+        except RayTaskError as error:
+            return worker, Outcome(error=error.cause)
+        except RayActorError:
+            self._hands[worker] = self._start()
+            return worker, Outcome()
+
+    def update(self, weights: Mapping[str, Tensor] | None, seed: int) -> None:
+        """See :class:`~dpa.rollout.crew.Crew`."""
+        kept = self._latest[0] if weights is None else ray.put({name: value.cpu() for name, value in weights.items()})
+        self._latest = (kept, seed)
+        for hand in self._hands:
+            hand.update.remote(*self._latest)
+
+    def close(self) -> None:
+        """See :class:`~dpa.rollout.crew.Crew`; the cluster stays."""
+        for hand in self._hands:
+            ray.kill(hand)
+
+    def _start(self) -> Any:
+        hand = self._hire(self._job, self._threads)
+        hand.update.remote(*self._latest)
+        return hand
+
+
+class _Hand:
+    """The actor."""
+
+    def __init__(self, job: RolloutJob, threads: int) -> None:
+        torch.set_num_threads(threads)
+        self._worker = RolloutWorker(job)
+
+    def update(self, weights: Mapping[str, Tensor] | None, seed: int) -> None:
+        self._worker.update(weights, seed)
+
+    def run(self, task: RolloutTask) -> TensorDictBase:
+        return self._worker.run(task).cpu()

@@ -1,0 +1,280 @@
+"""Collectors: the same rollouts whoever makes them, however they are cut up, interrupted, or killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterable
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.collectors import BaseCollector
+from torchrl.envs import TransformedEnv
+
+from dpa.policy import ContextOptions, Decoding, MotionActor, MotionLM
+from dpa.policy.actor import Contexts
+from dpa.ranking.transform import RankRollouts
+from dpa.rollout import RolloutCollector, Workers, bytes_per_row, make_collector
+from dpa.rollout.plan import GIB
+from dpa.tokens import TokenAction
+from envs import keys
+from envs.scene import Scene
+from envs.traffic import TrafficEnv
+
+SIZES = (2, 1, 3, 2)
+PROCESSES = Workers(2, "process")
+
+
+def budget(model: MotionLM, rows: int) -> float:
+    """GiB for so many agents times rollouts."""
+    return (rows + 0.5) * bytes_per_row(model.config, ContextOptions().max_pieces) / GIB
+
+
+def tokens_of(batches: Iterable[TensorDictBase], num_rollouts: int) -> dict[int, Tensor]:
+    """Tokens of every scene: index -> ``[K, T, A]`` without padding."""
+    found = {}
+    for batch in batches:
+        assert (batch[keys.STEP][..., 0] == torch.arange(batch.shape[1])).all(), "whole episodes"
+        assert batch["next", "done"][:, -1].all() and not batch["next", "done"][:, :-1].any()
+        for row, scene in enumerate(batch[keys.SCENE][::num_rollouts, 0].tolist()):
+            assert scene not in found
+            group = batch[row * num_rollouts : (row + 1) * num_rollouts]
+            assert (group[keys.SCENE] == scene).all()
+            found[scene] = group[keys.TOKEN][..., : SIZES[scene]]
+    return found
+
+
+def assert_same(first: dict[int, Tensor], second: dict[int, Tensor]) -> None:
+    assert first.keys() == second.keys()
+    for scene in first:
+        assert torch.equal(first[scene], second[scene]), scene
+
+
+@pytest.fixture
+def collect(model: MotionLM, scenes: list[Scene]) -> Callable[..., dict[int, Tensor]]:
+    """Collects two rollouts of each scene and gives their tokens."""
+
+    def collect(rows: int = 1000, **options: object) -> dict[int, Tensor]:
+        return tokens_of(make_collector(scenes, model, num_rollouts=2, memory=budget(model, rows), **options), 2)
+
+    return collect
+
+
+def test_every_scene_is_rolled_out_once(collect: Callable) -> None:
+    assert sorted(collect()) == [0, 1, 2, 3]
+    assert sorted(collect(indices=[3, 0])) == [0, 3]
+    assert collect(done=range(4)) == {}
+
+
+@pytest.mark.parametrize("rows", [1, 3, 4, 8])
+def test_rollouts_are_the_same_however_they_are_cut_up(collect: Callable, rows: int) -> None:
+    assert_same(collect(rows), collect())
+
+
+def test_rollouts_are_those_of_a_bare_loop(collect: Callable, model: MotionLM, scenes: list[Scene]) -> None:
+    for index, tokens in collect().items():
+        env = TransformedEnv(TrafficEnv([scenes[index]], num_rollouts=2), TokenAction(model.tokenizer))
+        actor = MotionActor(model.eval(), Contexts([scenes[index]]), num_rollouts=2, decoding=Decoding())
+        assert torch.equal(env.rollout(16, actor)[keys.TOKEN], tokens)
+
+
+def test_rollouts_depend_on_the_seed_and_on_nothing_global(collect: Callable) -> None:
+    first = collect(seed=0)
+    torch.manual_seed(99)
+    assert_same(collect(seed=0), first)
+    other = collect(seed=1)
+    assert not all(torch.equal(first[scene], other[scene]) for scene in first)
+
+
+@pytest.mark.parametrize("done", [[1], [0, 1], [0, 1, 2], [2]])
+def test_what_is_left_of_an_interrupted_collection_comes_out_as_it_would_have(
+    collect: Callable, done: list[int]
+) -> None:
+    whole, rest = collect(rows=8), collect(rows=8, done=done)
+    assert set(rest) >= set(range(4)) - set(done)
+    assert_same(rest, {scene: whole[scene] for scene in rest})
+
+
+def test_options_reach_environment_and_policy(model: MotionLM, scenes: list[Scene]) -> None:
+    options = ContextOptions(max_controlled=1, horizon=4)
+    greedy = Decoding(top_p=1e-6)
+    (batch,) = make_collector(scenes, model, num_rollouts=2, indices=[2], options=options, decoding=greedy)
+    assert batch.batch_size == (2, 4)
+    assert (batch[keys.CONTROLLED].sum(-1) == 1).all()
+    assert torch.equal(batch[keys.TOKEN][0], batch[keys.TOKEN][1])
+
+
+def test_post_processing_sees_whole_groups_although_they_were_rolled_out_in_pieces(
+    model: MotionLM, scenes: list[Scene]
+) -> None:
+    ranked = make_collector(
+        scenes,
+        model,
+        num_rollouts=4,
+        memory=budget(model, 3),
+        make_postproc=partial(RankRollouts, num_rollouts=4),
+    )
+    batches = list(ranked)
+    assert [batch[keys.SCENE].tolist() for batch in batches] == [[1], [0], [3], [2]]
+    for batch in batches:
+        assert sorted(batch[keys.RANK][0].tolist()) == [0, 1, 2, 3]
+
+
+# --- workers --------------------------------------------------------------------------------------------------------
+def kill_first_worker(flag: Path, scenes: object) -> Callable[[TensorDictBase], TensorDictBase]:
+    """Post-processing that kills its process, the first time that any worker comes to it."""
+
+    def process(batch: TensorDictBase) -> TensorDictBase:
+        if not flag.exists():
+            flag.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return batch
+
+    return process
+
+
+def kill_every_worker(scenes: object) -> Callable[[TensorDictBase], TensorDictBase]:
+    return lambda batch: os.kill(os.getpid(), signal.SIGKILL)
+
+
+def fail(scenes: object) -> Callable[[TensorDictBase], TensorDictBase]:
+    def process(batch: TensorDictBase) -> TensorDictBase:
+        raise ValueError("no such feature")
+
+    return process
+
+
+def test_processes_give_the_same_rollouts_in_the_same_order_although_one_is_killed(
+    model: MotionLM, scenes: list[Scene], tmp_path: Path
+) -> None:
+    def collected(**options: object) -> list[TensorDictBase]:
+        return list(make_collector(scenes, model, num_rollouts=2, memory=budget(model, 4), **options))
+
+    batches = collected(workers=PROCESSES, make_postproc=partial(kill_first_worker, tmp_path / "killed"))
+    expected = collected()
+    assert (tmp_path / "killed").exists()
+    assert [batch[keys.SCENE].tolist() for batch in batches] == [batch[keys.SCENE].tolist() for batch in expected]
+    assert_same(tokens_of(batches, 2), tokens_of(expected, 2))
+
+
+@pytest.mark.slow
+def test_a_task_that_kills_every_worker_is_given_up(collect: Callable) -> None:
+    with pytest.raises(ChildProcessError, match=r"3 workers were killed over the scenes \[.*\]"):
+        collect(workers=Workers(1, "process"), make_postproc=kill_every_worker)
+
+
+@pytest.mark.parametrize("workers", [None, pytest.param(Workers(1, "process"), marks=pytest.mark.slow)])
+def test_an_error_in_a_worker_is_raised_where_the_batch_is_asked_for(
+    collect: Callable, workers: Workers | None
+) -> None:
+    with pytest.raises(ValueError, match="no such feature"):
+        collect(workers=workers, make_postproc=fail)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"count": 0, "backend": "process"}, "count and threads must be 1 or more, got 0 and 1"),
+        ({"count": 2}, "2 workers need backend=process or backend=ray, got backend=local"),
+        ({"backend": "threads"}, "backend must be local, process or ray, got 'threads'"),
+    ],
+)
+def test_workers_that_make_no_sense_are_refused(options: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Workers(**options)
+
+
+def test_a_budget_that_holds_no_agent_is_refused(collect: Callable) -> None:
+    with pytest.raises(ValueError, match="memory must hold at least one agent, got .* GiB"):
+        collect(rows=-1)
+
+
+# --- as a collector of TorchRL --------------------------------------------------------------------------------------
+@pytest.fixture
+def stepwise(model: MotionLM, scenes: list[Scene]) -> Callable[..., RolloutCollector]:
+    """A collector of one scene at a time."""
+
+    def make(workers: Workers | None = None) -> RolloutCollector:
+        return make_collector(scenes, model, num_rollouts=2, memory=budget(model, 1), workers=workers)
+
+    return make
+
+
+def other_weights(model: MotionLM) -> dict[str, Tensor]:
+    return {name: value + 0.1 for name, value in model.state_dict().items()}
+
+
+@pytest.mark.parametrize("workers", [None, Workers(1, "process")])
+def test_new_weights_drive_from_the_next_batch_on(
+    stepwise: Callable, collect: Callable, model: MotionLM, workers: Workers | None
+) -> None:
+    before, weights = collect(), other_weights(model)
+    collector = stepwise(workers)
+    batches = []
+    for batch in collector:
+        batches.append(batch)
+        if len(batches) == 2:
+            collector.update_policy_weights_(TensorDict(weights).unflatten_keys("."))
+    found = tokens_of(batches, 2)
+    model.load_state_dict(weights)
+    after = collect()
+    assert_same(found, {scene: (before if place < 2 else after)[scene] for place, scene in enumerate(found)})
+    assert not torch.equal(before[2], after[2])
+
+
+@pytest.mark.parametrize("workers", [None, pytest.param(PROCESSES, marks=pytest.mark.slow)])
+def test_a_new_seed_holds_from_the_next_batch_on(
+    stepwise: Callable, collect: Callable, workers: Workers | None
+) -> None:
+    collector, batches = stepwise(workers), []
+    for batch in collector:
+        batches.append(batch)
+        collector.set_seed(len(batches))
+    found = tokens_of(batches, 2)
+    assert_same(found, {scene: collect(seed=place)[scene] for place, scene in enumerate(found)})
+
+
+def test_a_collector_goes_on_where_its_state_was_saved(stepwise: Callable) -> None:
+    whole = list(stepwise())
+    collector = stepwise()
+    for _ in zip(range(2), collector, strict=False):
+        state = collector.state_dict()
+    resumed = stepwise()
+    resumed.load_state_dict(state)
+    rest = list(resumed)
+    assert len(rest) == 2
+    for batch, expected in zip(rest, whole[2:], strict=True):
+        assert torch.equal(batch[keys.TOKEN], expected[keys.TOKEN])
+
+
+def test_unknown_weights_are_refused(stepwise: Callable) -> None:
+    with pytest.raises(ValueError, match=r"weights \['wings'\] are none of the model's"):
+        stepwise().update_policy_weights_({"wings": torch.zeros(1)})
+
+
+def test_it_is_a_collector_of_torchrl(stepwise: Callable) -> None:
+    collector = stepwise()
+    assert isinstance(collector, BaseCollector)
+    assert collector.next().batch_size == (2, 16)
+    collector.shutdown()
+
+
+@pytest.mark.slow
+def test_a_ray_cluster_gives_the_same_rollouts_and_survives_a_killed_worker(
+    collect: Callable, stepwise: Callable, model: MotionLM, tmp_path: Path
+) -> None:
+    ray = pytest.importorskip("ray")
+    workers = Workers(2, "ray")
+    try:
+        killing = partial(kill_first_worker, tmp_path / "killed")
+        assert_same(collect(rows=4, workers=workers, make_postproc=killing), collect(rows=4))
+        assert (tmp_path / "killed").exists()
+        with pytest.raises(ValueError, match="no such feature"):
+            collect(workers=workers, make_postproc=fail)
+        test_new_weights_drive_from_the_next_batch_on(stepwise, collect, model, workers)
+    finally:
+        ray.shutdown()
