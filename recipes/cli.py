@@ -16,6 +16,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
+from envs.allocator import keep_freed_memory
 from envs.options import differences
 
 CONFIG = {"version_base": "1.3", "config_path": str(Path(__file__).parent / "config")}
@@ -61,12 +62,13 @@ def interrupted() -> int:
 
 
 def check_resources(cfg: DictConfig) -> None:
-    """Set torch's threads and refuse a device that is not there, before any work.
+    """Set torch's threads and the allocator, and refuse a device that is not there, before any work.
 
     Raises:
         ValueError: no such device.
     """
     torch.set_num_threads(cfg.threads)
+    keep_freed_memory()
     if torch.device(cfg.device).type == "cuda" and not torch.cuda.is_available():
         raise ValueError(f"device={cfg.device}: torch {torch.__version__} finds no GPU here; say device=cpu.")
 

@@ -14,6 +14,10 @@ from envs.geometry.frames import to_local
 SCALE = 10.0
 """Metres that count as one in a feature."""
 FEATURES = 5
+CPU_NODES = 256
+"""Nodes that are pooled at a time on a CPU."""
+LOWEST = -1.0
+"""Below every value of GELU (its minimum is -0.17)."""
 
 
 class Vicinity(nn.Module):
@@ -57,10 +61,24 @@ class Vicinity(nn.Module):
         )
         seen = torch.isfinite(near)[..., None]
         features = features.where(seen, features.new_zeros(()))
-        each = self.inner(_gather(self.token(tokens), index) + self.relative(features))
-        # GELU is bounded below, so that an unseen token, at that bound, never wins the maximum.
-        pooled = each.masked_fill(~seen, LOWEST).amax(-2)
+        pooled = self._pool(tokens, index, features, seen)
         return self.out(pooled.where(seen.any(-2), pooled.new_zeros(())))
+
+    def _pool(self, tokens: Tensor, index: Tensor, features: Tensor, seen: Tensor) -> Tensor:
+        """``[B, Q, width]``: the maximum over what each of the nearest tokens says."""
+        # Part by part, so that what lies between two layers stays in the cache of a CPU: twice as fast.
+        nodes = CPU_NODES if tokens.device.type == "cpu" else len(tokens) * index.shape[1]
+        table, rows = self.token(tokens).flatten(0, 1) + self.relative.bias, _rows(tokens, index)
+        parts = zip(*(value.flatten(0, 1).split(nodes) for value in (rows, features, seen)), strict=True)
+        pooled = [self._pool_part(table, *part) for part in parts]
+        return torch.cat(pooled).view(*index.shape[:2], -1)
+
+    def _pool_part(self, table: Tensor, rows: Tensor, features: Tensor, seen: Tensor) -> Tensor:
+        """``[nodes, width]`` of ``[nodes, k, ...]``."""
+        said = torch.addmm(table.index_select(0, rows.flatten()), features.flatten(0, 1), self.relative.weight.T)
+        each = self.inner(said).view(*rows.shape, -1)
+        # GELU is bounded below, so that an unseen token, at that bound, never wins the maximum.
+        return each.masked_fill(~seen, LOWEST).amax(-2)
 
     @torch.no_grad()
     def _nearest(self, pose: Tensor, token_pose: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -72,12 +90,12 @@ class Vicinity(nn.Module):
         return near.sqrt(), index
 
 
-LOWEST = -1.0
-"""Below every value of GELU (its minimum is -0.17)."""
+def _rows(values: Tensor, index: Tensor) -> Tensor:
+    """Indices ``[B, Q, k]`` into ``[B, n]`` as indices into ``[B * n]``."""
+    return torch.arange(len(values), device=values.device)[:, None, None] * values.shape[1] + index
 
 
 def _gather(values: Tensor, index: Tensor) -> Tensor:
     """``[B, n, d]`` at ``[B, Q, k]`` to ``[B, Q, k, d]``."""
-    first = torch.arange(len(values), device=values.device)[:, None, None] * values.shape[1]
     # The gradient of index_select is one sum by row; that of indexing with tensors is many times slower on a CPU.
-    return values.flatten(0, 1).index_select(0, (first + index).flatten()).view(*index.shape, -1)
+    return values.flatten(0, 1).index_select(0, _rows(values, index).flatten()).view(*index.shape, -1)

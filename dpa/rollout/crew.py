@@ -14,6 +14,7 @@ from torch import Tensor
 
 from dpa.rollout.job import RolloutJob, RolloutWorker
 from dpa.rollout.plan import RolloutTask
+from envs.allocator import keep_freed_memory
 from envs.workers import end_with_parent
 
 
@@ -197,6 +198,7 @@ def _serve(pipe: connection.Connection, job: RolloutJob, threads: int) -> None:
     """Life of a worker process: tasks in, rollouts out, until the other end closes."""
     end_with_parent()
     torch.set_num_threads(threads)
+    keep_freed_memory()
     worker = RolloutWorker(job)
     try:
         while True:

@@ -15,6 +15,7 @@ from torch import Tensor
 from dpa.rollout.crew import Outcome, Workers
 from dpa.rollout.job import RolloutJob, RolloutWorker
 from dpa.rollout.plan import RolloutTask
+from envs.allocator import keep_freed_memory
 
 
 class RayCrew:
@@ -78,6 +79,7 @@ class _Hand:
 
     def __init__(self, job: RolloutJob, threads: int) -> None:
         torch.set_num_threads(threads)
+        keep_freed_memory()
         self._worker = RolloutWorker(job)
 
     def update(self, weights: Mapping[str, Tensor] | None, seed: int) -> None:
