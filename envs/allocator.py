@@ -24,4 +24,4 @@ def keep_freed_memory() -> bool:
         return False
     libc = ctypes.CDLL(None)
     options = ((_TRIM_THRESHOLD, _KEPT), (_MMAP_THRESHOLD, _KEPT), (_TOP_PAD, _PAD))
-    return all([libc.mallopt(name, value) for name, value in options])
+    return min(libc.mallopt(name, value) for name, value in options) == 1

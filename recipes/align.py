@@ -1,6 +1,7 @@
 """Align a policy with the preferences among its own rollouts (METHOD sections 5 and 6).
 
     python -m recipes.align method=dpa_omf policy=runs/pretrain/policy.pt preferences=runs/preferences
+    torchrun --nproc-per-node 2 -m recipes.align method=dpa_omf policy=FILE preferences=DIR  # docs/scale.md
 
 Methods differ in one YAML each: dpa_omf, dpa_adef, sft_best_oa, sft_best_ade, adversarial_afd. Run the same command
 again to go on after a kill.
@@ -22,6 +23,7 @@ from dpa.policy import MotionLM
 from dpa.preferences import PreferenceStore
 from dpa.report.figures import read_curves
 from dpa.training.batches import Item, ShuffledOrder, collate_items, micro_batches
+from dpa.training.distributed import ALONE, Ranks, join_ranks
 from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
 from dpa.training.run import Run
 from dpa.training.seeding import seed_everything
@@ -29,7 +31,7 @@ from envs import keys
 from envs.seeding import make_generator
 from envs.store import SceneStore
 from recipes.candidates import Group, make_candidates
-from recipes.cli import CONFIG, build, check_steps, finished, finite, plain, recipe, write_json
+from recipes.cli import CONFIG, build, check_steps, finished, finite, plain, ranked_recipe, write_json
 from recipes.models import open_policy, weights_digest, write_policy
 from recipes.scenes import fingerprint, open_splits
 
@@ -38,7 +40,14 @@ LOSSES: dict[str, type[LossModule]] = {"contrastive": ContrastivePreferenceLoss,
 
 
 def align(
-    cfg: DictConfig, method: DictConfig, scenes: SceneStore, policy: Path, preferences: Path, seed: int, folder: Path
+    cfg: DictConfig,
+    method: DictConfig,
+    scenes: SceneStore,
+    policy: Path,
+    preferences: Path,
+    seed: int,
+    folder: Path,
+    ranks: Ranks = ALONE,
 ) -> Path:
     """Fine-tune a policy with one method.
 
@@ -50,6 +59,7 @@ def align(
         preferences: folder of the store that :mod:`recipes.collect` made with the reference.
         seed: of batches and dropout.
         folder: of the run.
+        ranks: that train together; the scenes of a step are theirs together.
 
     Returns:
         The file of the aligned policy.
@@ -58,7 +68,9 @@ def align(
         ValueError: preferences of other scenes or of another policy, an unknown loss, or options that do not fit it.
     """
     options, path, result = cfg.alignment, folder / "policy.pt", folder / "result.json"
-    model, context, config = open_policy(policy, cfg.device)
+    ranks.share_of(options.scenes_per_step, "alignment.scenes_per_step")
+    device = ranks.place(cfg.device)
+    model, context, config = open_policy(policy, device)
     store = PreferenceStore(preferences)
     if store.provenance.scenes != fingerprint(scenes):
         raise ValueError(f"{preferences} ranks rollouts of other scenes; collect again with the scenes at hand.")
@@ -71,11 +83,11 @@ def align(
         "reference": weights_digest(model),
         "preferences": store.provenance.policy,
     }
-    if finished(result, decided_by) is not None and path.is_file():
+    if ranks.agree(finished(result, decided_by) is not None and path.is_file(), "finished =", folder):
         return path
     seed_everything(seed)
     candidates = make_candidates(method.data, store, scenes, context, model.tokenizer.cpu(), seed)
-    loss = make_loss(method.loss, model.to(cfg.device).train())
+    loss = ranks.wrap(make_loss(method.loss, model.to(device).train()))
     optimizer = make_optimizer(model, options.lr, options.weight_decay)
     schedule = make_schedule(optimizer, options.steps, options.warmup)
     order = ShuffledOrder(len(candidates), options.scenes_per_step, seed)
@@ -88,17 +100,21 @@ def align(
         backend=cfg.logger.backend,
         mode=cfg.logger.mode,
         description=method.name,
+        ranks=ranks,
     )
     with run:
         for step in run.steps():
             draw = make_generator(seed, "pairs", step)
             groups = [candidates[i] for i in order(step)]
-            losses = accumulate_gradients(loss, parts_of(groups, options, draw, cfg.device))
+            ranks.seed_dropout(seed, step)
+            losses = accumulate_gradients(loss, parts_of(groups, options, draw, device, ranks), ranks)
             norm = clip_and_step(optimizer, options.max_norm, schedule)
             run.log({f"train/{key}": value for key, value in losses.items()} | {"train/gradient_norm": norm})
-    write_policy(path, model, config, {"method": method.name, "seed": seed, "options": decided_by})
-    last = {name: finite(curve["value"][-1]) for name, curve in read_curves(folder).items()}
-    write_json(result, {"options": decided_by, "policy": str(path), "last_step": last})
+    if ranks.main:
+        write_policy(path, model, config, {"method": method.name, "seed": seed, "options": decided_by})
+        last = {name: finite(curve["value"][-1]) for name, curve in read_curves(folder).items()}
+        write_json(result, {"options": decided_by, "policy": str(path), "last_step": last})
+    ranks.wait()
     return path
 
 
@@ -111,18 +127,19 @@ def make_loss(section: DictConfig, model: MotionLM) -> LossModule:
 
 
 def parts_of(
-    groups: list[Group], options: DictConfig, draw: torch.Generator, device: str
+    groups: list[Group], options: DictConfig, draw: torch.Generator, device: str, ranks: Ranks = ALONE
 ) -> Iterator[tuple[TensorDict, float]]:
     """Drawn pairs (or targets) of scenes of similar size as batches, each with its share of the step.
 
-    A contrastive loss is a mean over pairs, of which each scene gives as many; imitation is a mean over tokens.
+    A contrastive loss is a mean over pairs, of which each scene gives as many; imitation is a mean over tokens. All
+    ranks draw for all scenes of the step, so that the pairs do not depend on their number, and each passes its own.
     """
     chosen = [torch.randperm(len(group.preferred), generator=draw)[: options.pairs_per_scene] for group in groups]
-    sizes = [group.token_valid.shape[0] * options.pairs_per_scene for group in groups]
     weights = [1 if group.unpreferred is not None else int(group.token_valid.sum()) for group in groups]
-    for part in micro_batches(sizes, options.max_rows):
-        share = sum(weights[i] for i in part) / sum(weights)
-        yield make_batch([(groups[i], chosen[i]) for i in part]).to(device), share
+    mine = ranks.mine(range(len(groups)))
+    for part in micro_batches([len(groups[i].token_valid) * options.pairs_per_scene for i in mine], options.max_rows):
+        share = sum(weights[mine[i]] for i in part) / sum(weights)
+        yield make_batch([(groups[mine[i]], chosen[mine[i]]) for i in part]).to(device), share
 
 
 def make_batch(chosen: list[tuple[Group, torch.Tensor]]) -> TensorDict:
@@ -139,13 +156,16 @@ def make_batch(chosen: list[tuple[Group, torch.Tensor]]) -> TensorDict:
 
 
 @hydra.main(**CONFIG, config_name="align")
-@recipe
+@ranked_recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.align``."""
     check_steps(cfg.alignment, "alignment")
     scenes = open_splits(cfg.scenes).train
-    path = align(cfg, cfg.method, scenes, Path(cfg.policy), Path(cfg.preferences), cfg.seed, Path(cfg.output))
-    print(f"policy: {path}")
+    policy, preferences = Path(cfg.policy), Path(cfg.preferences)
+    with join_ranks(cfg.device) as ranks:
+        path = align(cfg, cfg.method, scenes, policy, preferences, cfg.seed, Path(cfg.output), ranks)
+        if ranks.main:
+            print(f"policy: {path}")
 
 
 if __name__ == "__main__":

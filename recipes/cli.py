@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import functools
 import json
+import os
 import sys
+import time
 import warnings
 from collections.abc import Callable
 from inspect import Parameter, signature
@@ -16,17 +18,37 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
+from dpa.training.distributed import started_ranks
 from envs.allocator import keep_freed_memory
 from envs.options import differences
 
 CONFIG = {"version_base": "1.3", "config_path": str(Path(__file__).parent / "config")}
 """Arguments of ``hydra.main`` that all recipes share; with an absolute path, ``main`` may also be imported."""
 REFUSED_STATUS, INTERRUPTED_STATUS = 2, 130
+GRACE_SECONDS = 10.0
+"""Given to rank 0 to refuse what all ranks refuse alike: torchrun then ends the others, and one error is told."""
 USER_ERRORS = (ValueError, OSError, ImportError, FloatingPointError, HydraException, OmegaConfBaseException)
 
 
 def recipe(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
-    """Run a recipe; what a user can mend ends in one line on stderr and exit status 2."""
+    """Run a recipe of one process; what a user can mend ends in one line on stderr and exit status 2."""
+
+    @functools.wraps(main)
+    def alone(cfg: DictConfig) -> None:
+        ranks = started_ranks()
+        if not ranks.alone:
+            name = f"recipes.{Path(sys.argv[0]).stem}"
+            raise ValueError(
+                f"{name} runs in one process and torchrun has started {ranks.world_size}; start it with python -m "
+                f"{name}. Training is what torchrun is for: recipes.pretrain and recipes.align."
+            )
+        main(cfg)
+
+    return ranked_recipe(alone)
+
+
+def ranked_recipe(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
+    """Like :func:`recipe`, for one process or for several that ``torchrun`` has started."""
 
     @functools.wraps(main)
     def run(cfg: DictConfig) -> None:
@@ -50,14 +72,18 @@ def recipe(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
 
 
 def refused(error: object) -> int:
-    """Say what a user can mend; returns the exit status."""
+    """Say what a user can mend; returns the exit status. A rank that is refused alone says which it is."""
+    if rank := int(os.environ.get("RANK", "0")):
+        time.sleep(GRACE_SECONDS)
+        error = f"rank {rank}: {error}"
     print(f"error: {error}", file=sys.stderr)
     return REFUSED_STATUS
 
 
 def interrupted() -> int:
     """Say how to go on after Ctrl-C; returns the exit status that shells expect."""
-    print("interrupted; run the same command again to go on", file=sys.stderr)
+    if os.environ.get("RANK", "0") == "0":
+        print("interrupted; run the same command again to go on", file=sys.stderr)
     return INTERRUPTED_STATUS
 
 

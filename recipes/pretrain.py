@@ -2,6 +2,7 @@
 
     python -m recipes.pretrain                                   # SUMO scenes, made on the spot
     python -m recipes.pretrain scenes=gpudrive scenes.train=DIR scenes.eval=DIR output=runs/reference
+    torchrun --nproc-per-node 8 -m recipes.pretrain device=cuda pretraining.batch_size=64  # docs/scale.md
 
 The weights that are best on the tuning scenes become ``policy.pt``. Run the same command again to go on after a kill.
 """
@@ -21,6 +22,7 @@ from tensordict import TensorDict
 from dpa.losses import NextTokenLoss, token_network
 from dpa.policy import MotionLM
 from dpa.training.batches import Item, LogReader, collate_items, micro_batches
+from dpa.training.distributed import ALONE, Ranks, join_ranks
 from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
 from dpa.training.run import Run
 from dpa.training.seeding import seed_everything
@@ -30,12 +32,12 @@ from envs.loader import SceneLoader
 from envs.progress import progress
 from envs.scene import SceneSource
 from envs.seeding import make_generator
-from recipes.cli import CONFIG, build, check_steps, finished, plain, recipe, write_json
+from recipes.cli import CONFIG, build, check_steps, finished, plain, ranked_recipe, write_json
 from recipes.models import build_policy, context_options, policy_config, write_policy
 from recipes.scenes import Splits, fingerprint, open_splits
 
 
-def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path) -> Path:
+def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path, ranks: Ranks = ALONE) -> Path:
     """Train one reference policy.
 
     Args:
@@ -43,23 +45,29 @@ def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path) -> Path:
         splits: scenes.
         seed: of everything that draws.
         folder: of the run.
+        ranks: that train together; the batch of the options is theirs together.
 
     Returns:
         The file of the policy.
+
+    Raises:
+        ValueError: options that do not fit, or a folder with other options.
     """
     path, result, options = folder / "policy.pt", folder / "result.json", cfg.pretraining
     config = policy_config(cfg.model)
     decided_by = {"policy": config, "pretraining": plain(options), "seed": seed, "scenes": fingerprint(splits.train)}
-    if finished(result, decided_by) is not None and path.is_file():
+    if ranks.agree(finished(result, decided_by) is not None and path.is_file(), "finished =", folder):
         return path
     seed_everything(seed)
-    model = build_policy(config).to(cfg.device)
+    device = ranks.place(cfg.device)
+    model = build_policy(config).to(device)
     best = copy.deepcopy(model)
     read = log_reader(cfg, model)
-    train = training_items(splits.train, options, read, seed)
-    tune = log_items(splits.tune, replace(read, augment=Augmentation(), noise=0.0))
+    train = training_items(splits.train, options, read, seed, ranks)
+    tune = log_items(splits.tune, replace(read, augment=Augmentation(), noise=0.0), ranks)
     loss = NextTokenLoss(token_network(model), label_smoothing=options.label_smoothing)
     loss.set_keys(labels=keys.LABELS)
+    loss = ranks.wrap(loss)
     optimizer = make_optimizer(model, options.lr, options.weight_decay)
     schedule = make_schedule(optimizer, options.steps, options.warmup)
     run = Run(
@@ -71,6 +79,7 @@ def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path) -> Path:
         backend=cfg.logger.backend,
         mode=cfg.logger.mode,
         description="pretrain",
+        ranks=ranks,
     )
     run.state.setdefault("best_nll", float("inf"))
     if "train" in run.state:
@@ -80,25 +89,29 @@ def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path) -> Path:
         for step in run.steps():
             items = next(batches)
             run.state["train"] = train.state_dict()
-            losses = accumulate_gradients(loss, parts_of(items, options.max_rows, cfg.device))
+            ranks.seed_dropout(seed, step)
+            losses = accumulate_gradients(loss, parts_of(items, options.max_rows, device, ranks), ranks)
             norm = clip_and_step(optimizer, options.max_norm, schedule)
             run.log({f"train/{key}": value for key, value in losses.items()} | {"train/gradient_norm": norm})
             if (step + 1) % options.tune_interval == 0 or step + 1 == options.steps:
-                measured = negative_log_likelihood(model, tune, cfg.device)
+                measured = negative_log_likelihood(model, tune, device, ranks)
                 run.log({f"tune/{key}": value for key, value in measured.items()})
                 if measured["nll"] < run.state["best_nll"]:
                     run.state["best_nll"] = measured["nll"]
                     best.load_state_dict(model.state_dict())
-    write_policy(path, best, config, {"method": "reference", "seed": seed, "tune_nll": run.state["best_nll"]})
-    write_json(result, {"options": decided_by, "policy": str(path), "tune_nll": run.state["best_nll"]})
+    if ranks.main:
+        write_policy(path, best, config, {"method": "reference", "seed": seed, "tune_nll": run.state["best_nll"]})
+        write_json(result, {"options": decided_by, "policy": str(path), "tune_nll": run.state["best_nll"]})
+    ranks.wait()
     return path
 
 
-def parts_of(items: list[Item], max_rows: int, device: str) -> Iterator[tuple[TensorDict, float]]:
-    """Items of similar size as batches, each with its share of the valid tokens: the loss is a mean over tokens."""
+def parts_of(items: list[Item], max_rows: int, device: str, ranks: Ranks = ALONE) -> Iterator[tuple[TensorDict, float]]:
+    """Items of similar size as batches, each with its share of the valid tokens of all ranks."""
     tokens = [int(item.token_valid.sum()) for item in items]
+    total = max(1, int(ranks.sum(torch.tensor(sum(tokens)))))
     for part in micro_batches([item.tokens.shape[1] for item in items], max_rows):
-        share = sum(tokens[i] for i in part) / sum(tokens)
+        share = sum(tokens[i] for i in part) / total
         yield collate_items([items[i] for i in part]).to(device), share
 
 
@@ -114,35 +127,40 @@ def log_reader(cfg: DictConfig, model: MotionLM) -> LogReader:
     )
 
 
-def training_items(scenes: SceneSource, options: DictConfig, read: LogReader, seed: int) -> SceneLoader:
-    """Lists of tokenized logs, read from the store as they are needed: memory does not grow with the scenes."""
+def training_items(
+    scenes: SceneSource, options: DictConfig, read: LogReader, seed: int, ranks: Ranks = ALONE
+) -> SceneLoader:
+    """Lists of tokenized logs for this rank, read as they are needed: memory does not grow with the scenes."""
     return SceneLoader(
         scenes,
-        options.batch_size,
+        ranks.share_of(options.batch_size, "pretraining.batch_size"),
         seed=seed,
         prepare=read,
         collate=with_tokens,
+        rank=ranks.rank,
+        world_size=ranks.world_size,
         workers=options.workers,
         drop_last=False,
     )
 
 
 def with_tokens(items: list[Item]) -> list[Item]:
-    """Those that have something to predict; without them the loss of a batch would be 0 / 0."""
-    return [item for item in items if item.token_valid.any()]
+    """Those that have something to predict; if there are none, one that does not count: no rank is without a pass."""
+    return [item for item in items if item.token_valid.any()] or items[:1]
 
 
-def log_items(scenes: SceneSource, read: LogReader) -> list[Item]:
-    """Tokenized logs of a few scenes, always the same."""
-    bar = progress(range(len(scenes)), "tokens", unit="scene")
+def log_items(scenes: SceneSource, read: LogReader, ranks: Ranks = ALONE) -> list[Item]:
+    """This rank's part of the tokenized logs of a few scenes, always the same."""
+    bar = progress(ranks.mine(range(len(scenes))), "tokens", unit="scene", disable=not ranks.main)
     return with_tokens([read(scenes[index], make_generator(0, "tune", index)) for index in bar])
 
 
 @torch.no_grad()
-def negative_log_likelihood(model: MotionLM, items: list[Item], device: str) -> dict[str, float]:
+def negative_log_likelihood(model: MotionLM, items: list[Item], device: str, ranks: Ranks = ALONE) -> dict[str, float]:
     """Per valid token [nats]: ``nll`` of all agents and ``nll_moving`` of those whose velocity changes at all.
 
-    A standing agent repeats one token and is easy; it would hide how moving agents are predicted.
+    A standing agent repeats one token and is easy; it would hide how moving agents are predicted. Each rank gives the
+    items that it measures; sums and counts are added up, so it is the mean over the items of all ranks.
     """
     model.eval()
     totals = torch.zeros(2, 2, dtype=torch.float64)
@@ -156,17 +174,21 @@ def negative_log_likelihood(model: MotionLM, items: list[Item], device: str) -> 
         for row, mask in enumerate((valid, valid & changes)):
             totals[row] += torch.tensor([nll[mask].sum(), mask.sum()], dtype=torch.float64)
     model.train()
+    totals = ranks.sum(totals)
     every, moving = (totals[:, 0] / totals[:, 1].clamp(min=1)).tolist()
     return {"nll": every, "nll_moving": moving}
 
 
 @hydra.main(**CONFIG, config_name="pretrain")
-@recipe
+@ranked_recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.pretrain``."""
     check_steps(cfg.pretraining, "pretraining")
-    path = pretrain(cfg, open_splits(cfg.scenes), cfg.seed, Path(cfg.output))
-    print(f"policy: {path}")
+    splits = open_splits(cfg.scenes)
+    with join_ranks(cfg.device) as ranks:
+        path = pretrain(cfg, splits, cfg.seed, Path(cfg.output), ranks)
+        if ranks.main:
+            print(f"policy: {path}")
 
 
 if __name__ == "__main__":

@@ -55,7 +55,7 @@ def commands() -> list[str]:
     found = set()
     for path in COMMANDED:
         for line in path.read_text(encoding="utf-8").splitlines():
-            for match in re.finditer(r"python -m ((?:recipes|envs|dpa)\.?[\w.]*[^`#)]*)", line):
+            for match in re.finditer(r"(?:python|torchrun\b[^`]*?) -m ((?:recipes|envs|dpa)\.?[\w.]*[^`#)]*)", line):
                 # Prose goes on after a comma or a colon; a comment stands two spaces away.
                 ends = r"\s{2,}|[:;,]\s|[:,.]$|\.\.\." + ('|"' if path.suffix == ".py" else "")
                 command = re.split(ends, match[1])[0].strip()

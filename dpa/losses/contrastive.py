@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F
 from torchrl.objectives import LossModule
 
-from dpa.losses.network import CONTEXT, LOGITS, masked_mean, token_log_prob
+from dpa.losses.network import CONTEXT, LOGITS, scene_mean, token_log_prob
 from envs import keys
 
 Reduction = Literal["sum", "agent_mean", "token_mean"]
@@ -40,14 +40,15 @@ class ContrastivePreferenceLoss(LossModule):
         reference: subtract the log-likelihood under a frozen copy of the network as it is now.
         score_reduction: ``"sum"`` over agents and decisions as in eq. 4, ``"agent_mean"`` sums over decisions and
             averages over agents, ``"token_mean"`` averages over both.
-        cloning: weight of the negative log-likelihood per token of the preferred rollouts.
+        cloning: weight of the negative log-likelihood per token of the preferred rollouts, averaged over scenes.
 
     Raises:
         ValueError: an option outside its range.
 
     Returns ``loss_preference``, ``loss_cloning`` and, detached: ``logit_mean``, ``logit_std``, ``weight_mean`` and
     ``saturated`` of the pairs, ``pair_accuracy`` (the preferred rollout is the more likely one), ``nll_preferred``,
-    ``nll_unpreferred`` and ``entropy`` per token [nats] and, with a reference, ``kl`` to it per token [nats].
+    ``nll_unpreferred`` and ``entropy`` per token [nats] and, with a reference, ``kl`` to it per token [nats]. Every
+    one is a mean over scenes, so a step is the same however its scenes are split into parts or among ranks.
 
     Examples:
         >>> from dpa.losses import token_network
@@ -157,16 +158,16 @@ class ContrastivePreferenceLoss(LossModule):
             with torch.no_grad(), self.target_actor_network_params.to_module(self.actor_network):
                 reference = self.actor_network(batch.select(CONTEXT, keys.TOKENS, keys.TOKEN_VALID))[LOGITS]
             gain = log_prob - token_log_prob(reference, tokens)
-            drift = {"kl": masked_mean(_divergence(logits.detach(), reference), valid)}
+            drift = {"kl": scene_mean(_divergence(logits.detach(), reference), valid)}
         preferred, unpreferred = (self.alpha * self._reduce(gain, valid)).chunk(2, 1)
         logit = preferred - self.conservative * unpreferred
-        nll, nll_unpreferred = (masked_mean(-side, valid) for side in log_prob.chunk(2, 1))
+        nll, nll_unpreferred = (scene_mean(-side, valid) for side in log_prob.chunk(2, 1))
         out = {"loss_preference": F.softplus(-logit).mean(), "loss_cloning": self.cloning * nll}
         with torch.no_grad():
             likelier = torch.gt(*self._reduce(log_prob, valid).chunk(2, 1))
             out |= _pair_diagnostics(logit.detach())
             out |= {"pair_accuracy": likelier.to(logit.dtype).mean(), "nll_preferred": nll.detach()}
-            out |= {"nll_unpreferred": nll_unpreferred.detach(), "entropy": masked_mean(_entropy(logits), valid)}
+            out |= {"nll_unpreferred": nll_unpreferred.detach(), "entropy": scene_mean(_entropy(logits), valid)}
             out |= drift
         return TensorDict(out, batch_size=[])
 

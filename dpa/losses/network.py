@@ -31,6 +31,21 @@ def masked_mean(value: Tensor, mask: Tensor) -> Tensor:
     return value.where(mask, value.new_zeros(())).sum() / mask.sum().clamp(min=1)
 
 
+def scene_mean(value: Tensor, mask: Tensor) -> Tensor:
+    """Mean over scenes ``[S, ...]`` of the mean of each one's entries where ``mask`` is true; 0 for a scene without.
+
+    Unlike a mean over all entries it does not depend on which scenes share a part of a batch.
+
+    Examples:
+        >>> import torch
+        >>> scene_mean(torch.tensor([[1.0, 3.0], [6.0, 9.0]]), torch.tensor([[True, True], [True, False]]))
+        tensor(4.)
+    """
+    mask = mask.expand_as(value)
+    within = tuple(range(1, value.ndim))
+    return (value.where(mask, value.new_zeros(())).sum(within) / mask.sum(within).clamp(min=1)).mean()
+
+
 def token_log_prob(logits: Tensor, tokens: Tensor) -> Tensor:
     """Log-probability of each token [nats]: ``[..., V]`` and ``[...]`` to ``[...]``."""
     return logits.log_softmax(-1).gather(-1, tokens[..., None])[..., 0]

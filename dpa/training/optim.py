@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
-from typing import Literal
+from collections.abc import Callable, Iterable, Iterator
+from typing import Literal, TypeVar
 
 import torch
 from tensordict import TensorDictBase
@@ -12,6 +12,9 @@ from torch import Tensor, nn
 from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
+from dpa.training.distributed import ALONE, Ranks, without_sync
+
+T = TypeVar("T")
 EMBEDDINGS = (nn.Embedding, nn.EmbeddingBag)
 BETAS = (0.9, 0.95)
 """Decay rates of AdamW's moments; 0.95 is usual for transformers, whose gradients have heavy tails."""
@@ -95,17 +98,26 @@ def make_schedule(
 
 
 def accumulate_gradients(
-    loss: Callable[[TensorDictBase], TensorDictBase], parts: Iterable[tuple[TensorDictBase, float]]
+    loss: Callable[[TensorDictBase], TensorDictBase],
+    parts: Iterable[tuple[TensorDictBase, float]],
+    ranks: Ranks = ALONE,
 ) -> dict[str, Tensor]:
-    """Gradients of a loss over a batch that is passed in parts.
+    """Gradients of a loss over a batch that is passed in parts, on one rank or several.
+
+    Ranks may have different numbers of parts: gradients are exchanged once, in the backward pass of each one's last.
 
     Args:
-        loss: gives ``loss_*`` entries, which are summed, and figures.
-        parts: each part with its share of the whole; shares sum to 1.
+        loss: gives ``loss_*`` entries, which are summed, and figures; with several ranks, what
+            :meth:`~dpa.training.distributed.Ranks.wrap` returned.
+        parts: this rank's parts, each with its share of the whole; the shares of all ranks sum to 1.
+        ranks: that pass the batch together.
 
     Returns:
-        Every entry over the whole batch, detached: means weighted by share; a figure ``x_std`` beside ``x_mean`` is the
-        spread over all parts together.
+        Every entry over the whole batch of all ranks, detached: means weighted by share; a figure ``x_std`` beside
+        ``x_mean`` is the spread over all parts together.
+
+    Raises:
+        ValueError: this rank has no part, and the others would wait for it.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -117,17 +129,33 @@ def accumulate_gradients(
         (tensor(3.), tensor(3.))
     """
     means: dict[str, Tensor] = {}
-    for batch, share in parts:
-        found = loss(batch)
-        (share * sum(value for key, value in found.items() if key.startswith("loss_"))).backward()
+    for (batch, share), last in _mark_last(parts):
+        with without_sync(loss, last):
+            found = loss(batch)
+            total = sum(value for key, value in found.items() if key.startswith("loss_"))
+            (ranks.world_size * share * total).backward()  # the exchange divides by the number of ranks
         figures = {key: value.detach() for key, value in found.items()}
         for key in _spreads(figures):
             figures[key] = figures[key] ** 2 + figures[key.removesuffix("_std") + "_mean"] ** 2
         for key, value in figures.items():
             means[key] = means.get(key, 0) + share * value
+    if not means and not ranks.alone:
+        raise ValueError(f"rank {ranks.rank} has no part of the batch; give it one, if need be with a share of 0.")
+    means = ranks.sum_figures(means)
     for key in _spreads(means):
         means[key] = (means[key] - means[key.removesuffix("_std") + "_mean"] ** 2).clamp(min=0).sqrt()
     return means
+
+
+def _mark_last(parts: Iterable[T]) -> Iterator[tuple[T, bool]]:
+    """Each part, and whether it is the last."""
+    before: list[T] = []
+    for part in parts:
+        if before:
+            yield before.pop(), False
+        before.append(part)
+    if before:
+        yield before.pop(), True
 
 
 def _spreads(figures: dict[str, Tensor]) -> list[str]:

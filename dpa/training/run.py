@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from dpa.training.checkpoint import Checkpointer, Stateful, capture, restore
+from dpa.training.distributed import ALONE, Ranks
 from dpa.training.loggers import Backend, make_logger
 from envs.options import differences
 from envs.progress import progress
@@ -40,6 +41,11 @@ class Run:
         backend: where curves go beside CSV.
         mode: of Weights & Biases.
         description: of the progress bar.
+        ranks: that train together, each with its own ``Run``. All go on from the same checkpoint, and the main one
+            alone writes files and shows progress.
+
+    Raises:
+        ValueError: the folder holds a run with other options, or ranks do not see the same folder.
 
     Examples:
         >>> import tempfile
@@ -65,12 +71,13 @@ class Run:
         backend: Backend = "csv",
         mode: Literal["online", "offline"] = "offline",
         description: str = "train",
+        ranks: Ranks = ALONE,
     ) -> None:
         if checkpoint_interval < 1:
             raise ValueError(f"checkpoint_interval must be positive, got {checkpoint_interval}.")
         self.folder, self.parts = Path(folder), parts
         self.total_steps, self.checkpoint_interval = total_steps, checkpoint_interval
-        self.description = description
+        self.description, self.ranks = description, ranks
         self.state: dict[str, Any] = {}
         """Plain values that are kept in every checkpoint, for the recipe's own use."""
         self._checkpoints = Checkpointer(self.folder / "checkpoints", config=config)
@@ -79,15 +86,21 @@ class Run:
         if saved is not None:
             restore(saved, parts)
             self.state = dict(saved["progress"])
-        self.first_step = 0 if saved is None else saved["step"]
-        self._logger = make_logger(backend, self.folder, config, resume_step=saved and saved["step"], mode=mode)
+        step = None if saved is None else saved["step"]
+        self.first_step = ranks.agree(step or 0, "a checkpoint of step", self.folder)
+        self._logger = make_logger(backend, self.folder, config, resume_step=step, mode=mode) if ranks.main else None
         self._step = self.first_step
 
     def steps(self) -> Iterator[int]:
         """Steps that are left, counted from 0; saves a checkpoint after every interval and after the last one."""
         start = time.perf_counter()
-        bar = progress(total=self.total_steps, description=self.description, initial=self.first_step, unit="step")
-        with bar:
+        with progress(
+            total=self.total_steps,
+            description=self.description,
+            initial=self.first_step,
+            unit="step",
+            disable=not self.ranks.main,
+        ) as bar:
             for step in range(self.first_step, self.total_steps):
                 self._step = step + 1
                 yield step
@@ -95,14 +108,17 @@ class Run:
                 done = step + 1
                 if done % self.checkpoint_interval == 0 or done == self.total_steps:
                     self.log({"time/seconds_per_step": (time.perf_counter() - start) / (done - self.first_step)})
-                    self._checkpoints.save(done, capture(self.parts, progress=self.state))
+                    if self.ranks.main:
+                        self._checkpoints.save(done, capture(self.parts, progress=self.state))
 
     def log(self, metrics: Mapping[str, Any]) -> None:
-        """Write numbers for the step at hand, as ``"<group>/<name>"``."""
-        self._logger.log(metrics, self._step)
+        """Write numbers for the step at hand, as ``"<group>/<name>"``; on the main rank only."""
+        if self._logger is not None:
+            self._logger.log(metrics, self._step)
 
     def __enter__(self) -> Run:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._logger.close()
+        if self._logger is not None:
+            self._logger.close()

@@ -14,7 +14,8 @@ from envs.allocator import keep_freed_memory
 torch.set_num_threads(1)
 if sys.argv[1] == "keep":
     assert keep_freed_memory()
-torch.ones(1 << 23)
+for _ in range(20):
+    torch.ones(1 << 23)
 before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 for _ in range(20):
     torch.ones(1 << 23)
