@@ -22,6 +22,8 @@ LARGEST_ID = 2**62
 """Ids up to this one fit int64 with room to count on from them."""
 MOST_ITEMS = 200_000
 """Of one list or object that is asked item by item; the lists of a scene have some thousands."""
+MOST_LETTERS = 200
+"""Of a value in an error message."""
 _KEY = re.compile(r"-?[0-9]{1,18}")
 """An id as the key of an entry, within int64."""
 
@@ -196,6 +198,7 @@ def shown(value: Any) -> str:
         ('nan', "'xxxxxxxxxxxx...xxxxxxxxxxxxx'")
     """
     try:
-        return reprlib.repr(value)
+        text = reprlib.repr(value)
     except ValueError:  # an integer of more digits than Python likes to print
         return f"a number of about {int(math.log10(2) * value.bit_length())} digits"
+    return text if len(text) <= MOST_LETTERS else text[:MOST_LETTERS] + "..."

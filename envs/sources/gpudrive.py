@@ -26,7 +26,7 @@ from envs.sources.files import find_files, read_file
 from envs.sources.recording import KIND_OF_FEATURE, LightListing, Polyline, Recording
 from envs.sources.source import Notes, Record, Source
 
-MAX_BYTES = 1 << 25
+MAX_BYTES = 1 << 24
 """Of an unpacked file; a scene has about 5 MB, and decoded JSON takes up to forty times its size in memory."""
 MAX_XZ_MEMORY = 1 << 28
 """Bytes for unpacking itself: a file of some bytes can ask for gigabytes; the highest level of xz asks for 65 MiB."""

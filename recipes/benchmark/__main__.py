@@ -2,6 +2,7 @@
 
 python -m recipes.benchmark realism                                # crowded scenes made on the spot
 python -m recipes.benchmark realism --scenarios FILE --json out.json    # scenarios of your own
+python -m recipes.benchmark rollout --sweep                        # against a naive decoder and the machine's limit
 python -m recipes.benchmark scenes womd FILES                      # size and speed of stores
 """
 
@@ -15,11 +16,12 @@ from pathlib import Path
 
 import torch
 
-from recipes.benchmark import realism, scenes
+from recipes.benchmark import realism, rollout, scenes
 from recipes.cli import write_json
 
 PARTS = {
     "realism": (realism, "seconds of the realism metric per scene"),
+    "rollout": (rollout, "agent-steps per second with the policy in the loop"),
     "scenes": (scenes, "raw files against a store: size, conversion, batches"),
 }
 

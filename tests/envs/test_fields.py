@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from envs.scene import SceneError
-from envs.sources.fields import LARGEST_ID, Field
+from envs.sources.fields import LARGEST_ID, Field, shown
 
 
 def field(value: Any, path: str = "a.b") -> Field:
@@ -90,3 +90,8 @@ def test_an_error_stays_short_whatever_the_value() -> None:
 
 if __name__ == "__main__":
     pytest.main([__file__])
+
+
+def test_a_value_of_any_depth_is_shown_in_a_part_of_a_line() -> None:
+    point = {"x": -2292.0485964632376, "y": -9414.106851291828, "z": -39.45788746194938}
+    assert len(shown([{"geometry": [point] * 9, "type": "road_edge"}] * 9)) < 250

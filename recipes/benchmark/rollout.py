@@ -1,0 +1,230 @@
+"""Agent-steps of 0.1 s per second with the policy in the loop, against a naive decoder and the limit of the machine.
+
+Each case has a process, and so a peak of memory, of its own. Scenes are made on the spot; weights are random, which
+costs as much as trained ones.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import resource
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.table import Table
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode
+from torchrl.envs import TransformedEnv
+
+from dpa.policy import SIZES, Decoding, MotionActor, MotionLM
+from dpa.policy.actor import Contexts, pad_context
+from dpa.policy.context import collate_contexts
+from dpa.rollout import RolloutTask, RolloutWorker
+from dpa.rollout.job import RolloutJob
+from dpa.tokens import TokenAction, VerletTokenizer
+from envs import keys
+from envs.allocator import keep_freed_memory
+from envs.progress import progress
+from envs.scene import Scene
+from envs.traffic import TrafficEnv
+from recipes.benchmark.realism import crowded_scene
+
+KIB_PER_GIB = 1 << 20
+SEGMENTS = 5000
+"""Of the road edges of a scene: more than the policy's map pieces, as in WOMD."""
+MATRIX = 1024
+"""Rows and columns of the product that the limit is measured with."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """What one measurement is of.
+
+    Attributes:
+        how: ``incremental`` is the bare loop with a cache, ``naive`` the one that encodes all anew for each decision,
+            ``collector`` the collector that recipes use.
+        agents: of each scene, all controlled.
+        rollouts: of each scene.
+        scenes: side by side.
+        size: of the model.
+        threads: of torch.
+        repeats: episodes; the median counts.
+        device: where model and environment are.
+    """
+
+    how: str
+    agents: int
+    rollouts: int
+    scenes: int
+    size: str
+    threads: int
+    repeats: int
+    device: str
+
+    @property
+    def agent_steps(self) -> int:
+        """Of one episode: 80 steps of 0.1 s of every agent of every rollout."""
+        return self.agents * self.rollouts * self.scenes * 80
+
+
+class NaiveActor(MotionActor):
+    """Encodes the scene and all decisions so far anew for each decision; what decoding is without a cache."""
+
+    def logits(self, tensordict: TensorDictBase) -> Tensor:
+        """``[B, A, V]`` of the decision at hand; all rows stand at the same one."""
+        step, scene = int(tensordict[keys.STEP][0, 0]), tensordict[keys.SCENE]
+        if step == 0:
+            self._start(scene, tensordict[keys.STEP][:, 0], tensordict[keys.VALID].shape)
+            self._taken = torch.zeros(*tensordict[keys.VALID].shape, self.model.config.horizon, dtype=torch.int64)
+            self._taken = self._taken.to(scene.device)
+        else:
+            self._taken[..., step - 1] = self._last
+        rows = scene[:: self.num_rollouts].tolist()
+        context = pad_context(collate_contexts([self.contexts[i] for i in rows]), self._taken.shape[1]).to(scene.device)
+        steps = self.model.tokenizer.steps * (step + 1)
+        context = context.clone(recurse=False)
+        context.logged, context.logged_valid = context.logged[:, :, :steps], context.logged_valid[:, :, :steps]
+        tokens = self._taken[..., : step + 1].unflatten(0, (len(rows), -1))
+        valid = context.controlled[:, None, :, None].expand(-1, 1, -1, step + 1)
+        return self.model(context, tokens, valid)[..., -1, :].flatten(0, 1)
+
+
+def add_options(part: argparse.ArgumentParser) -> None:
+    """Options of ``python -m recipes.benchmark rollout``."""
+    part.add_argument("--size", choices=sorted(SIZES), default="paper", help="of the model (default: %(default)s)")
+    part.add_argument("--agents", type=int, default=32, help="of a scene (default: %(default)s)")
+    part.add_argument("--rollouts", type=int, default=32, help="of a scene (default: %(default)s)")
+    part.add_argument("--scenes", type=int, default=1, help="side by side (default: %(default)s)")
+    part.add_argument("--threads", type=int, default=torch.get_num_threads(), help="of torch (default: %(default)s)")
+    part.add_argument("--repeats", type=int, default=5, metavar="N", help="the median counts (default: %(default)s)")
+    part.add_argument("--device", default="cpu", help="cpu or cuda (default: %(default)s)")
+    part.add_argument("--sweep", action="store_true", help="also vary agents, rollouts and scenes, one at a time")
+
+
+def measure(options: dict[str, Any]) -> list[dict[str, Any]]:
+    """Run the part and print its tables."""
+    main = Case("incremental", **{key: value for key, value in options.items() if key != "sweep"})
+    cases = [main, replace(main, how="collector"), replace(main, how="naive")]
+    if options["sweep"]:
+        cases += sweep(main)
+    rows = [asdict(case) | _apart(case) for case in progress(cases, "rollout", unit="case")]
+    _print(rows[:3], f"rollouts, {main.size} model, {main.device}, {main.threads} threads")
+    if options["sweep"]:
+        _print(rows[3:], "growth")
+    limit = _limit(main, rows[0])
+    Console(width=110).print(_facts(rows, limit))
+    return [*rows, limit]
+
+
+def sweep(main: Case) -> list[Case]:
+    """Half and double, and further, of one number at a time."""
+    grown = {"agents": (8, 16, 64, 128), "rollouts": (8, 16, 64), "scenes": (2, 4)}
+    return [replace(main, **{name: value}) for name, values in grown.items() for value in values]
+
+
+def _apart(case: Case) -> dict[str, float]:
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(run, (case,))
+
+
+def run(case: Case) -> dict[str, float]:
+    """Measure one case in this process: seconds of an episode, agent-steps per second, GiB beyond the start."""
+    torch.set_num_threads(case.threads)
+    keep_freed_memory()
+    torch.manual_seed(0)
+    model = MotionLM(case.size, VerletTokenizer()).to(case.device).eval()
+    scenes = [crowded_scene(case.agents, SEGMENTS, seed=index) for index in range(case.scenes)]
+    episode = _collected(case, model, scenes) if case.how == "collector" else _bare(case, model, scenes)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    seconds = statistics.median([_timed(episode, case.device) for _ in range(case.repeats + 1)][1:])
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    gib = torch.cuda.max_memory_allocated() / (1 << 30) if case.device != "cpu" else peak / KIB_PER_GIB
+    return {"seconds": seconds, "agent_steps_per_second": case.agent_steps / seconds, "gib": gib}
+
+
+def _bare(case: Case, model: MotionLM, scenes: list[Scene]) -> Callable[[], object]:
+    """Environment and policy called in turn, and nothing kept."""
+    env = TrafficEnv(scenes, num_scenes=case.scenes, num_rollouts=case.rollouts, device=case.device)
+    driven = TransformedEnv(env, TokenAction(model.tokenizer))
+    kind = NaiveActor if case.how == "naive" else MotionActor
+    actor = kind(model, Contexts(scenes), num_rollouts=case.rollouts, decoding=Decoding())
+
+    def episode() -> None:
+        state = driven.reset()
+        for _ in range(model.config.horizon):
+            state = driven.step(actor(state))["next"].exclude(keys.REWARD)
+
+    return torch.no_grad()(episode)
+
+
+def _collected(case: Case, model: MotionLM, scenes: list[Scene]) -> Callable[[], object]:
+    """What recipes do: environment, policy and collector made anew for each task."""
+    worker = RolloutWorker(RolloutJob(scenes, model, case.rollouts, device=case.device))
+    task = RolloutTask(tuple(range(case.scenes)), (range(case.rollouts),))
+    return lambda: worker.run(task)
+
+
+def _timed(work: Callable[[], object], device: str) -> float:
+    start = time.perf_counter()
+    work()
+    if device != "cpu":
+        torch.cuda.synchronize()
+    return time.perf_counter() - start
+
+
+def _limit(case: Case, row: dict[str, Any]) -> dict[str, float]:
+    """The measured rate of matrix products over the model's operations: what no decoder can exceed on this machine."""
+    torch.set_num_threads(case.threads)
+    operations = operations_per_agent_step(case)
+    rate = matmul_rate(case.device)
+    most = rate / operations
+    return {
+        "operations_per_agent_step": operations,
+        "matmul_per_second": rate,
+        "agent_steps_per_second_at_most": most,
+        "fraction_reached": row["agent_steps_per_second"] / most,
+    }
+
+
+def operations_per_agent_step(case: Case) -> float:
+    """Floating-point operations of matrix products and attention in one incremental episode, over its agent-steps."""
+    model = MotionLM(case.size, VerletTokenizer()).eval()
+    few = replace(case, how="incremental", rollouts=min(case.rollouts, 4), scenes=1, device="cpu")
+    episode = _bare(few, model, [crowded_scene(case.agents, SEGMENTS)])
+    with torch.nn.attention.sdpa_kernel(torch.nn.attention.SDPBackend.MATH), FlopCounterMode(display=False) as counter:
+        episode()
+    return counter.get_total_flops() / few.agent_steps
+
+
+def matmul_rate(device: str) -> float:
+    """Operations per second of a large matrix product in float32, the best of some."""
+    left, right = (torch.randn(MATRIX, MATRIX, device=device) for _ in range(2))
+    fastest = min(_timed(lambda: left @ right, device) for _ in range(20))
+    return 2 * MATRIX**3 / fastest
+
+
+def _print(rows: list[dict[str, Any]], title: str) -> None:
+    table = Table("", "scenes", "rollouts", "agents", "s per episode", "agent-steps/s", "GiB", title=title)
+    for row in rows:
+        sizes = (str(row[name]) for name in ("scenes", "rollouts", "agents"))
+        table.add_row(
+            row["how"], *sizes, f"{row['seconds']:.2f}", f"{row['agent_steps_per_second']:,.0f}", f"{row['gib']:.2f}"
+        )
+    Console(width=110).print(table)
+
+
+def _facts(rows: list[dict[str, Any]], limit: dict[str, float]) -> str:
+    bare, collector, naive = (row["agent_steps_per_second"] for row in rows[:3])
+    reached = f"{limit['agent_steps_per_second_at_most']:,.0f} agent-steps/s, {limit['fraction_reached']:.0%} reached"
+    return (
+        f"incremental over naive: {bare / naive:.1f} times; collector over bare loop: {collector / bare:.2f}\n"
+        f"{limit['operations_per_agent_step'] / 1e6:.2f} MFLOP per agent-step at "
+        f"{limit['matmul_per_second'] / 1e9:.0f} GFLOP/s (float32 {MATRIX} x {MATRIX}): at most {reached}"
+    )
