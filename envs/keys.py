@@ -52,6 +52,14 @@ SAMPLING_LOG_PROB: NestedKey = (AGENTS, "sampling_log_prob")
 # --- what a step gives back -----------------------------------------------------------------------------------------
 REWARD: NestedKey = (AGENTS, "reward")
 """``[B, A, 1]``: minus the mean displacement from the log over the decision's poses [m]."""
+COLLISION: NestedKey = (AGENTS, "collision")
+"""``[B, A]`` bool: the agent's box overlapped another one in the decision (on request)."""
+OFFROAD: NestedKey = (AGENTS, "offroad")
+"""``[B, A]`` bool: a corner of the agent's box was off the road in the decision (on request)."""
+PROGRESS: NestedKey = (AGENTS, "progress")
+"""``[B, A]``: metres that the agent advanced along its own logged path in the decision (on request)."""
+RED_LIGHT: NestedKey = (AGENTS, "red_light")
+"""``[B, A]`` bool: the agent passed the stop point of a red light in the decision (on request)."""
 DONE: NestedKey = "done"
 TERMINATED: NestedKey = "terminated"
 TRUNCATED: NestedKey = "truncated"

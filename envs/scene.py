@@ -97,6 +97,10 @@ class LightState(IntEnum):
     FLASHING_CAUTION = 8
 
 
+RED_STATES = (LightState.ARROW_STOP, LightState.STOP)
+"""States at which vehicles may not pass the stop point (SPEC section 4.2)."""
+
+
 class Lacks(IntFlag):
     """What a recording does not have; a model or a metric that needs it must not take the stand-in for data."""
 
@@ -242,6 +246,9 @@ class Scene(TensorClass["nocast"]):
     lacks: Tensor
     scene_id: str
 
+    def __deepcopy__(self, memo: dict) -> Scene:
+        return self.clone()  # Gymnasium copies the arguments of an environment; tensordict's own way warns
+
     def validate(self, name: str | None = None) -> Scene:
         """Check one uncollated scene and return it.
 
@@ -321,3 +328,14 @@ def polylines(scene: Scene, kinds: Sequence[int]) -> list[Tensor]:
     road = scene.road
     keep = torch.isin(road.kind, torch.as_tensor(tuple(kinds)))
     return [road.points[s : s + n] for s, n in zip(road.start[keep].tolist(), road.count[keep].tolist(), strict=True)]
+
+
+def surface_streets(road: RoadMap) -> tuple[list[Tensor], Tensor]:
+    """The lanes of one uncollated map that lights rule, in map order; a lane of a single point is left out.
+
+    Returns:
+        Their points, each ``[n, 2]``, and their ``feature_id`` ``[lanes]``.
+    """
+    index = ((road.kind == MapKind.LANE_SURFACE_STREET) & (road.count >= 2)).nonzero()[:, 0]
+    ends = zip(road.start[index].tolist(), road.count[index].tolist(), strict=True)
+    return [road.points[start : start + count, :2] for start, count in ends], road.feature_id[index]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from numbers import Integral
 from typing import Literal
 
 import torch
@@ -12,10 +14,17 @@ from torchrl.envs import EnvBase
 
 from envs import keys
 from envs.geometry.frames import to_world
-from envs.scene import CURRENT_STEP, LOG_STEPS, AgentKind, Scene, SceneSource, collate, select_agents
-
-MAX_CONTROLLED = 128
-"""Agents of one scene that a policy moves at most (WOSAC; SPEC section 1.2)."""
+from envs.participants import (
+    MAX_CONTROLLED,
+    Control,
+    check_control,
+    choose_controlled,
+    largest_scene,
+    pad_agents,
+    simulated_agents,
+)
+from envs.scene import CURRENT_STEP, LOG_STEPS, AgentKind, Scene, SceneSource, collate
+from envs.signals import Signals
 
 
 class TrafficEnv(EnvBase):
@@ -23,16 +32,19 @@ class TrafficEnv(EnvBase):
 
     An episode starts at the current step of a log, with one second of history, and takes ``horizon`` decisions of
     ``decision_steps`` poses. The agents of a scene are those valid at its current step, in the order of the scene,
-    padded to ``num_agents``. Up to ``max_controlled`` of them follow their actions to the end: evaluated agents first,
-    then those nearest to the SDC. The rest follow their log, and ``("agents", "controlled")`` says which.
+    padded to ``num_agents``. Of those that ``control`` allows, up to ``max_controlled`` follow their actions to the
+    end: evaluated agents first, then those nearest to the SDC. The rest follow and leave with their log, and
+    ``("agents", "controlled")`` says which. With ``arrivals``, agents that the log brings in later come after the
+    present ones; they always follow their log, and are not ``valid`` before it begins.
 
     The K rollouts of a scene are contiguous rows. A scene gives way to the next one when all its rows are reset; a row
     that is reset alone starts its scene again. The map stays out of the observations: ``scene`` is its index in
     ``scenes``.
 
     Specs (shapes in :mod:`envs.keys`): observations ``scene``, ``step`` and, under ``agents``, ``recent``, ``valid``,
-    ``controlled``, ``kind``; action ``("agents", "action")``: the next F poses in the agent's own frame; reward
-    ``("agents", "reward")``: minus the mean displacement from the log over the decision [m]; ``done`` at the horizon.
+    ``controlled``, ``kind`` and the ``signals`` asked for; action ``("agents", "action")``: the next F poses in the
+    agent's own frame; reward ``("agents", "reward")``: minus the mean displacement from the log over the decision [m]
+    (:class:`~envs.rewards.SignalReward` makes another one); ``done`` at the horizon.
 
     Args:
         scenes: where scenes come from.
@@ -40,15 +52,22 @@ class TrafficEnv(EnvBase):
     Keyword Args:
         num_scenes: S.
         num_rollouts: K.
-        num_agents: A; by default the largest number of agents of any scene in ``scenes``.
+        num_agents: A; by default the largest number of agents of any scene in ``scenes``, for which ``arrivals`` reads
+            them all.
         max_controlled: agents of a scene that are controlled at most.
-        decision_steps: F.
+        control: ``"all"``, ``"sdc"``, ``"predict"`` (the tracks to predict), or a function that is given one scene with
+            its present agents and gives an ``[A]`` bool mask of them.
+        arrivals: agents that are logged in the episode but not at its beginning take part.
+        signals: names of :data:`~envs.signals.SIGNALS` to compute in every decision: ``"collision"``, ``"offroad"``,
+            ``"progress"``, ``"red_light"``; one that is not named costs nothing.
+        decision_steps: F, 1 to 10.
         horizon: T, decisions in an episode.
         order: ``"sequential"`` takes the scenes in turn, ``"random"`` draws them with the environment's seed.
         device: where states live.
 
     Raises:
-        ValueError: no scenes, a horizon beyond the log, or a scene with more than ``num_agents`` agents.
+        ValueError: no scenes, an option that makes no sense, a horizon beyond the log, or a scene with more than
+            ``num_agents`` agents.
 
     Examples:
         >>> from envs.sources.synthetic import straight_road
@@ -56,6 +75,9 @@ class TrafficEnv(EnvBase):
         >>> rollout = env.rollout(16)
         >>> rollout["next", "agents", "recent"].shape
         torch.Size([8, 16, 3, 6, 3])
+        >>> env = TrafficEnv([straight_road(3)], control="sdc", signals=("collision", "progress"), horizon=4)
+        >>> env.rollout(4)["next", "agents", "collision"].shape
+        torch.Size([1, 4, 3])
     """
 
     batch_locked = True
@@ -68,6 +90,9 @@ class TrafficEnv(EnvBase):
         num_rollouts: int = 1,
         num_agents: int | None = None,
         max_controlled: int = MAX_CONTROLLED,
+        control: Control = "all",
+        arrivals: bool = False,
+        signals: Sequence[str] = (),
         decision_steps: int = 5,
         horizon: int = 16,
         order: Literal["sequential", "random"] = "sequential",
@@ -75,18 +100,22 @@ class TrafficEnv(EnvBase):
     ) -> None:
         if len(scenes) == 0:
             raise ValueError("TrafficEnv needs at least one scene, got an empty source.")
-        if CURRENT_STEP + decision_steps * horizon >= LOG_STEPS:
-            raise ValueError(
-                f"horizon * decision_steps must be at most {LOG_STEPS - 1 - CURRENT_STEP} steps of 0.1 s, got "
-                f"{horizon} * {decision_steps}."
-            )
+        if order not in ("sequential", "random"):
+            raise ValueError(f"order must be 'sequential' or 'random', got {order!r}.")
+        check_control(control)
+        sizes = {"num_scenes": num_scenes, "num_rollouts": num_rollouts, "max_controlled": max_controlled}
+        sizes |= {} if num_agents is None else {"num_agents": num_agents}
+        _check_positive(**sizes, decision_steps=decision_steps, horizon=horizon)
+        _check_episode(decision_steps, horizon)
         super().__init__(device=device, batch_size=[num_scenes * num_rollouts])
         self.scenes = scenes
         self.num_scenes, self.num_rollouts = num_scenes, num_rollouts
-        self.num_agents = num_agents if num_agents is not None else largest_scene(scenes)
-        self.max_controlled = max_controlled
+        self.max_controlled, self.control = max_controlled, control
         self.decision_steps, self.horizon = decision_steps, horizon
         self.order = order
+        self._cast = {"arrivals": arrivals, "last_step": CURRENT_STEP + decision_steps * horizon}
+        self.num_agents = largest_scene(scenes, **self._cast) if num_agents is None else num_agents
+        self._signals = Signals(signals, num_rollouts, self.device) if signals else None
         self._cursor = 0
         self._generator = torch.Generator()
         self._scene = torch.full((num_scenes,), -1)
@@ -105,6 +134,7 @@ class TrafficEnv(EnvBase):
                     controlled=Categorical(shape=agents, **flag),
                     kind=Categorical(len(AgentKind), shape=agents, dtype=torch.int64, device=self.device),
                     shape=agents,
+                    **({} if self._signals is None else self._signals.specs(agents)),
                 ),
             },
             shape=batch,
@@ -137,7 +167,11 @@ class TrafficEnv(EnvBase):
             self._load(finished | (self._scene < 0))
         self._recent = torch.where(rows[:, None, None, None], self._start, self._recent)
         self._step_count = torch.where(rows[:, None], 0, self._step_count)
-        return self._observe()
+        out = self._observe()
+        if self._signals is not None:
+            self._signals.reset(rows)
+            out[keys.AGENTS].update(self._signals.nothing(out[keys.AGENTS].shape))
+        return out
 
     def _load(self, groups: Tensor) -> None:
         """Give the next scenes to some of the S groups (``[S]`` bool) and lay out the logs of all."""
@@ -151,26 +185,31 @@ class TrafficEnv(EnvBase):
         batch = collate(scenes).to(self.device)
         each = self._repeat
         agents = batch.agents
-        end = CURRENT_STEP + self.decision_steps * self.horizon + 1
+        end = self._cast["last_step"] + 1
         fresh = not hasattr(self, "_start")
         self._start = each(agents.recent(self.decision_steps))
         self._log = each(agents.poses[..., CURRENT_STEP + 1 : end, :].unflatten(-2, (-1, self.decision_steps)))
         self._log_valid = each(agents.valid[..., CURRENT_STEP + 1 : end].unflatten(-1, (-1, self.decision_steps)))
         self._present = each(agents.present)
         self._kind = each(agents.kind)
-        self._controlled = each(choose_controlled(batch, self.max_controlled))
+        self._controlled = each(
+            torch.stack([choose_controlled(s, self.max_controlled, self.control) for s in scenes]).to(self.device)
+        )
+        if self._signals is not None:
+            self._signals.load(self._scene.tolist(), scenes, batch)
         if fresh:
             self._recent = self._start.clone()
             self._step_count = torch.zeros(*self.batch_size, 1, dtype=torch.int64, device=self.device)
 
     def _padded(self, index: int) -> Scene:
         """One scene with the agents of the simulation only, padded to A."""
-        scene = present_agents(self.scenes[index])
+        scene = simulated_agents(self.scenes[index], **self._cast)
         missing = self.num_agents - scene.agents.kind.shape[0]
         if missing < 0:
+            when = "in the episode" if self._cast["arrivals"] else "at the current step"
             raise ValueError(
-                f"scene {scene.scene_id} has {self.num_agents - missing} agents at the current step and the "
-                f"environment holds {self.num_agents}; raise num_agents."
+                f"scene {scene.scene_id} has {self.num_agents - missing} agents {when} and the environment holds "
+                f"{self.num_agents}; raise num_agents."
             )
         return pad_agents(scene, missing)
 
@@ -184,6 +223,7 @@ class TrafficEnv(EnvBase):
         index = self._step_count[:, 0].clamp(max=self.horizon - 1)
         rows = torch.arange(len(index), device=self.device)
         log, log_valid = self._log[rows, :, index], self._log_valid[rows, :, index]
+        before = None if self._signals is None else self._valid_now()
         moved = to_world(tensordict[keys.ACTION], current)
         poses = torch.where(self._controlled[..., None, None], moved, log)
         self._recent = torch.cat((current, poses), -2)
@@ -192,14 +232,22 @@ class TrafficEnv(EnvBase):
         error = (poses[..., :2] - log[..., :2]).norm(dim=-1) * log_valid
         reward = -error.sum(-1) / log_valid.sum(-1).clamp(min=1)
         out = self._observe()
+        if before is not None:
+            later = torch.where(self._controlled[..., None], self._present[..., None], log_valid)
+            valid, first = torch.cat((before[..., None], later), -1), CURRENT_STEP + index * self.decision_steps
+            out[keys.AGENTS].update(self._signals.measure(self._recent, valid, self._controlled, first))
         out[keys.REWARD] = reward[..., None]
         out[keys.DONE], out[keys.TRUNCATED], out[keys.TERMINATED] = done, done.clone(), torch.zeros_like(done)
         return out
 
-    def _observe(self) -> TensorDict:
+    def _valid_now(self) -> Tensor:
+        """``[B, A]`` bool: the agent is there; a controlled one to the end, a replayed one while it is logged."""
         rows = torch.arange(len(self._recent), device=self.device)
-        last = (self._step_count[:, 0] - 1).clamp(min=0)
+        last = (self._step_count[:, 0] - 1).clamp(0, self.horizon - 1)
         logged = torch.where(self._step_count > 0, self._log_valid[rows, :, last, -1], self._present)
+        return torch.where(self._controlled, self._present, logged)
+
+    def _observe(self) -> TensorDict:
         return TensorDict(
             {
                 keys.SCENE: self._repeat(self._scene.to(self.device)),
@@ -207,7 +255,7 @@ class TrafficEnv(EnvBase):
                 keys.AGENTS: TensorDict(
                     {
                         "recent": self._recent,
-                        "valid": torch.where(self._controlled, self._present, logged),
+                        "valid": self._valid_now(),
                         "controlled": self._controlled,
                         "kind": self._kind,
                     },
@@ -219,49 +267,19 @@ class TrafficEnv(EnvBase):
         )
 
 
-def present_agents(scene: Scene) -> Scene:
-    """The scene with the agents that are valid at its current step only: those of a simulation, in their order."""
-    return select_agents(scene, scene.agents.present)
+def _check_positive(**sizes: int) -> None:
+    for name, value in sizes.items():
+        if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
+            raise ValueError(f"{name} must be a whole number of 1 or more, got {value!r}.")
 
 
-def largest_scene(scenes: SceneSource) -> int:
-    """The largest number of present agents of any scene; a store knows it without loading scenes."""
-    counts = getattr(scenes, "num_agents", None)
-    if counts is None:
-        counts = [int(scenes[i].agents.present.sum()) for i in range(len(scenes))]
-    return int(max(counts))
-
-
-def pad_agents(scene: Scene, missing: int) -> Scene:
-    """Append invalid agents to an uncollated scene."""
-    scene = scene.clone(recurse=False)
-    agents = scene.agents.clone(recurse=False)
-    for field in agents.__dataclass_fields__:
-        value = getattr(agents, field)
-        fill = -1 if field == "track_id" else 0
-        setattr(agents, field, torch.cat((value, value.new_full((missing, *value.shape[1:]), fill))))
-    scene.agents = agents
-    return scene
-
-
-def choose_controlled(batch: Scene, limit: int) -> Tensor:
-    """Which present agents a policy moves: evaluated agents first, then those nearest to the SDC.
-
-    Args:
-        batch: collated scenes.
-        limit: agents of one scene at most.
-
-    Returns:
-        ``[S, A]`` bool.
-
-    Examples:
-        >>> from envs.sources.synthetic import straight_road
-        >>> choose_controlled(collate([straight_road(3)]), limit=1)
-        tensor([[ True, False, False]])
-    """
-    agents = batch.agents
-    xy = agents.position[:, :, CURRENT_STEP, :2]
-    sdc = (xy * agents.sdc[..., None]).sum(1, keepdim=True)
-    distance = (xy - sdc).norm(dim=-1) - agents.sdc * 2e6 - agents.predict * 1e6
-    rank = distance.masked_fill(~agents.present, torch.inf).argsort(stable=True, dim=-1).argsort(-1)
-    return agents.present & (rank < limit)
+def _check_episode(decision_steps: int, horizon: int) -> None:
+    if decision_steps > CURRENT_STEP:
+        raise ValueError(
+            f"decision_steps must be at most the {CURRENT_STEP} steps of 0.1 s of the history, got {decision_steps}."
+        )
+    if CURRENT_STEP + decision_steps * horizon >= LOG_STEPS:
+        raise ValueError(
+            f"horizon * decision_steps must be at most {LOG_STEPS - 1 - CURRENT_STEP} steps of 0.1 s, got "
+            f"{horizon} * {decision_steps}."
+        )

@@ -15,8 +15,8 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from envs.geometry.frames import rotate, to_local, wrap_angle
-from envs.scene import CURRENT_STEP, LOG_STEPS, STEP_SECONDS, Agents, Lights, LightState, RoadMap, Scene, collate
-from envs.traffic import MAX_CONTROLLED, choose_controlled, present_agents
+from envs.participants import MAX_CONTROLLED, Control, check_control, choose_controlled, simulated_agents
+from envs.scene import CURRENT_STEP, LOG_STEPS, STEP_SECONDS, Agents, Lights, LightState, RoadMap, Scene
 
 PIECE_POINTS = 5
 """Points that describe a piece."""
@@ -33,14 +33,16 @@ class ContextOptions:
     """How a scene is cut up for the policy.
 
     Attributes:
-        max_pieces: map pieces kept, those nearest to where any agent is or may soon be.
+        max_pieces: map pieces kept, those nearest to where any present agent is or may soon be.
         piece_length: target length of a map piece [m].
         max_controlled: agents that the policy moves at most.
         decision_steps: F.
         horizon: T.
+        control: whom the policy may move, as in :class:`~envs.traffic.TrafficEnv`.
+        arrivals: agents that the log brings in later take part, as in :class:`~envs.traffic.TrafficEnv`.
 
     Raises:
-        ValueError: a number that is not positive, or an episode longer than a log.
+        ValueError: a number that is not positive, an episode longer than a log, or a control that is none.
     """
 
     max_pieces: int = 512
@@ -48,11 +50,14 @@ class ContextOptions:
     max_controlled: int = MAX_CONTROLLED
     decision_steps: int = 5
     horizon: int = 16
+    control: Control = "all"
+    arrivals: bool = False
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            if getattr(self, field.name) <= 0:
-                raise ValueError(f"{field.name} must be positive, got {getattr(self, field.name)}.")
+        for name in ("max_pieces", "piece_length", "max_controlled", "decision_steps", "horizon"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
+        check_control(self.control)
         if HISTORY + self.decision_steps * self.horizon > LOG_STEPS:
             raise ValueError(
                 f"horizon * decision_steps must be at most {LOG_STEPS - HISTORY} steps of 0.1 s, got "
@@ -77,9 +82,10 @@ class SceneContext(TensorClass["nocast"]):
         extent: ``[*, A, 3]`` [m].
         kind: ``[*, A]`` :class:`~envs.scene.AgentKind`.
         recent: ``[*, A, F + 1, 3]`` poses of the last decision before the episode.
-        valid: ``[*, A]`` bool, padding is false.
+        valid: ``[*, A]`` bool, the agent is there at the current step; false for padding and arrivals.
         controlled: ``[*, A]`` bool.
-        logged: ``[*, A, T * F, 3]`` logged poses to come; 0 where invalid.
+        logged: ``[*, A, T * F, 3]`` logged poses to come; 0 where invalid, but for arrivals that are still to come, see
+            :func:`~envs.participants.simulated_agents`.
         logged_valid: ``[*, A, T * F]`` bool.
     """
 
@@ -107,7 +113,7 @@ AGENT_FIELDS = ("history", "history_valid", "extent", "kind", "recent", "valid",
 
 
 def make_context(scene: Scene, options: ContextOptions | None = None) -> SceneContext:
-    """Cut up one uncollated scene; its agents are those present at the current step, in order.
+    """Cut up one uncollated scene; its agents are those of a simulation: the present ones, then arrivals.
 
     Examples:
         >>> from envs.sources.synthetic import straight_road
@@ -115,11 +121,12 @@ def make_context(scene: Scene, options: ContextOptions | None = None) -> SceneCo
         torch.Size([2, 11, 3])
     """
     options = options or ContextOptions()
-    scene = present_agents(scene)
+    steps = options.decision_steps * options.horizon
+    scene = simulated_agents(scene, arrivals=options.arrivals, last_step=CURRENT_STEP + steps)
     agents = scene.agents
     poses, current = agents.poses, agents.poses[:, CURRENT_STEP]
     valid_history = agents.valid[:, :HISTORY]
-    future = slice(HISTORY, HISTORY + options.decision_steps * options.horizon)
+    future = slice(HISTORY, HISTORY + steps)
     pieces = _map_pieces(scene.road, scene.lights, _reach(agents, options), options)
     map_pose, map_points, map_kind, map_light = pieces
     light_pose = _light_poses(scene.road, scene.lights)
@@ -137,8 +144,8 @@ def make_context(scene: Scene, options: ContextOptions | None = None) -> SceneCo
         extent=agents.extent,
         kind=agents.kind,
         recent=agents.recent(options.decision_steps),
-        valid=torch.ones(len(agents.kind), dtype=torch.bool),
-        controlled=choose_controlled(collate([scene]), options.max_controlled)[0],
+        valid=agents.present,
+        controlled=choose_controlled(scene, options.max_controlled, options.control),
         logged=poses[:, future],
         logged_valid=agents.valid[:, future],
         batch_size=[],
@@ -165,10 +172,10 @@ def keep_agents(context: SceneContext, index: Tensor) -> SceneContext:
 
 
 def _reach(agents: Agents, options: ContextOptions) -> Tensor:
-    """``[n, 2]``: where agents are, and where they would be each second of the episode at constant velocity."""
+    """``[n, 2]``: where present agents are, and would be each second of the episode at constant velocity."""
     seconds = torch.arange(0.0, options.decision_steps * options.horizon * STEP_SECONDS + 0.5)
-    ahead = agents.velocity[:, CURRENT_STEP, None] * seconds[:, None]
-    places = (agents.position[:, CURRENT_STEP, None, :2] + ahead).flatten(0, 1)
+    ahead = agents.velocity[agents.present, CURRENT_STEP, None] * seconds[:, None]
+    places = (agents.position[agents.present, CURRENT_STEP, None, :2] + ahead).flatten(0, 1)
     return torch.unique((places / REACH_GRID).round(), dim=0) * REACH_GRID  # the standing ones count once
 
 

@@ -154,12 +154,12 @@ def node_validity(context: SceneContext, token_valid: Tensor) -> Tensor:
         token_valid: ``[S, M, A, T]`` bool.
 
     Returns:
-        ``[S, M, A, T]`` bool: a controlled agent counts while the tokens before are valid, a replayed one while it is
-        logged.
+        ``[S, M, A, T]`` bool: a controlled agent counts while the tokens before are valid, a replayed one, which may
+        arrive later, while it is logged.
     """
     horizon = token_valid.shape[-1]
     present = context.valid[:, None, :, None].expand(*token_valid.shape[:-1], 1)
     steps = context.logged_valid.shape[-1] // max(horizon, 1)
     ends = context.logged_valid.unflatten(-1, (-1, steps))[..., -1][:, None].expand_as(token_valid)
-    later = torch.where(context.controlled[:, None, :, None], token_valid, ends)[..., :-1]
-    return torch.cat((present, later & present), -1)
+    later = torch.where(context.controlled[:, None, :, None], token_valid & present, ends)[..., :-1]
+    return torch.cat((present, later), -1)

@@ -19,7 +19,7 @@ from dpa.rollout.plan import RolloutTask
 from dpa.tokens import TokenAction
 from envs import keys
 from envs.scene import Scene, SceneSource
-from envs.traffic import TrafficEnv, largest_scene
+from envs.traffic import TrafficEnv
 
 PostProcess = Callable[[TensorDictBase], TensorDictBase]
 
@@ -119,7 +119,8 @@ class RolloutWorker:
             part,
             num_scenes=len(part),
             num_rollouts=len(piece),
-            num_agents=largest_scene(part),
+            control=options.control,
+            arrivals=options.arrivals,
             max_controlled=options.max_controlled,
             decision_steps=options.decision_steps,
             horizon=options.horizon,

@@ -6,9 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-import ray
 import torch
-from ray.exceptions import RayActorError, RayTaskError
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -29,13 +27,14 @@ class RayCrew:
     """
 
     def __init__(self, job: RolloutJob, workers: Workers) -> None:
-        if not ray.is_initialized():
-            ray.init(address=workers.address, include_dashboard=False, log_to_driver=False, logging_level="error")
+        self._ray = _ray()
+        if not self._ray.is_initialized():
+            self._ray.init(address=workers.address, include_dashboard=False, log_to_driver=False, logging_level="error")
         self.size = workers.count
         needs = {"num_cpus": workers.threads, "num_gpus": int(str(job.device).startswith("cuda"))}
-        self._hire = ray.remote(**needs, max_restarts=0)(_Hand).remote
+        self._hire = self._ray.remote(**needs, max_restarts=0)(_Hand).remote
         self._threads = workers.threads
-        self._job = ray.put(replace(job, model=job.model.cpu(), device=str(job.device)))
+        self._job = self._ray.put(replace(job, model=job.model.cpu(), device=str(job.device)))
         self._latest: tuple[Any, int] = (None, job.seed)
         self._hands = [self._start() for _ in range(self.size)]
         self._running: dict[Any, int] = {}
@@ -46,19 +45,23 @@ class RayCrew:
 
     def wait(self) -> tuple[int, Outcome]:
         """See :class:`~dpa.rollout.crew.Crew`."""
-        (ready, *_), _ = ray.wait(list(self._running), num_returns=1)
+        (ready, *_), _ = self._ray.wait(list(self._running), num_returns=1)
         worker = self._running.pop(ready)
         try:
-            return worker, Outcome(ray.get(ready))
-        except RayTaskError as error:
+            return worker, Outcome(self._ray.get(ready))
+        except self._ray.exceptions.RayTaskError as error:
             return worker, Outcome(error=error.cause)
-        except RayActorError:
+        except self._ray.exceptions.RayActorError:
             self._hands[worker] = self._start()
             return worker, Outcome()
 
     def update(self, weights: Mapping[str, Tensor] | None, seed: int) -> None:
         """See :class:`~dpa.rollout.crew.Crew`."""
-        kept = self._latest[0] if weights is None else ray.put({name: value.cpu() for name, value in weights.items()})
+        kept = (
+            self._latest[0]
+            if weights is None
+            else self._ray.put({name: value.cpu() for name, value in weights.items()})
+        )
         self._latest = (kept, seed)
         for hand in self._hands:
             hand.update.remote(*self._latest)
@@ -66,12 +69,20 @@ class RayCrew:
     def close(self) -> None:
         """See :class:`~dpa.rollout.crew.Crew`; the cluster stays."""
         for hand in self._hands:
-            ray.kill(hand)
+            self._ray.kill(hand)
 
     def _start(self) -> Any:
         hand = self._hire(self._job, self._threads)
         hand.update.remote(*self._latest)
         return hand
+
+
+def _ray() -> Any:
+    try:
+        import ray
+    except ImportError as error:
+        raise ImportError("workers on Ray need the extra `ray`: pip install 'dpa-omf[ray]'.") from error
+    return ray
 
 
 class _Hand:

@@ -83,14 +83,34 @@ def lift(poses: Tensor, start: Tensor, points: Tensor) -> Tensor:
     ground = Ground(points)
     start = start.to(poses)
     first = ground.height(start[:, :2], start[:, 2]).expand(poses.shape[:2])
-    above = start[:, 2] - first  # kept in every look-up, so that an agent that stands finds the same point again
-
-    knots = _knots(poses.shape[2])
-    heights = [first]
-    for knot in knots[1:]:
-        heights.append(ground.height(poses[:, :, knot - 1, :2], heights[-1] + above))
-    rise = _interpolate(knots, torch.stack(heights, -1) - first[..., None])
+    rise = climb(ground, poses, start[:, 2].expand(poses.shape[:2]), first)
     return torch.cat((poses[..., :2], (start[:, 2, None] + rise)[..., None], poses[..., 2:]), -1)
+
+
+def climb(ground: Ground, poses: Tensor, height: Tensor, below: Tensor) -> Tensor:
+    """How far agents rise as they move, see :func:`lift`.
+
+    Args:
+        ground: of the map.
+        poses: ``[..., T, 3]`` or ``[..., T, 2]``, x, y at 10 Hz from the step after the current one on.
+        height: ``[...]``, z of the agents' centres at the current step [m].
+        below: ``[...]``, height of the ground below them [m].
+
+    Returns:
+        ``[..., T]``, change of z since the current step [m].
+
+    Examples:
+        >>> ground = Ground(torch.tensor([[x, 0.0, float(x > 5)] for x in range(20)]))
+        >>> ahead = torch.arange(1.0, 11.0)[:, None] * torch.tensor([[[1.0, 0.0]]])
+        >>> climb(ground, ahead, torch.tensor([0.75]), torch.tensor([0.0]))[0, [0, 4, 9]]
+        tensor([0., 0., 1.])
+    """
+    knots = _knots(poses.shape[-2])
+    # The height above the ground is kept in every look-up, so that an agent that stands finds the same point again.
+    above, heights = height - below, [below]
+    for knot in knots[1:]:
+        heights.append(ground.height(poses[..., knot - 1, :2], heights[-1] + above))
+    return _interpolate(knots, torch.stack(heights, -1) - below[..., None])
 
 
 def _knots(steps: int) -> list[int]:

@@ -15,9 +15,10 @@ from torchrl.envs.utils import check_env_specs
 from dpa.tokens import TokenAction, VerletTokenizer
 from envs import keys
 from envs.geometry.frames import to_local
-from envs.scene import CURRENT_STEP, AgentKind, MapKind, Scene, collate
+from envs.participants import choose_controlled, largest_scene
+from envs.scene import CURRENT_STEP, AgentKind, MapKind, Scene
 from envs.sources.synthetic import build_scene, straight_road, two_cars_head_on
-from envs.traffic import TrafficEnv, choose_controlled, largest_scene
+from envs.traffic import TrafficEnv
 
 EDGE = [(MapKind.EDGE_BOUNDARY, torch.tensor([[50.0, 5.0], [-50.0, 5.0]]))]
 
@@ -179,15 +180,15 @@ def crowd() -> Scene:
     ("limit", "expected"), [(1, [1]), (2, [1, 5]), (3, [1, 2, 5]), (4, [1, 2, 4, 5]), (6, [0, 1, 2, 3, 4, 5])]
 )
 def test_evaluated_agents_are_controlled_first_and_then_the_nearest_to_the_sdc(limit: int, expected: list[int]) -> None:
-    chosen = choose_controlled(collate([crowd()]), limit)
-    assert chosen[0].nonzero()[:, 0].tolist() == expected
-    assert TrafficEnv([crowd()], max_controlled=limit).reset()[keys.CONTROLLED][0].tolist() == chosen[0].tolist()
+    chosen = choose_controlled(crowd(), limit)
+    assert chosen.nonzero()[:, 0].tolist() == expected
+    assert TrafficEnv([crowd()], max_controlled=limit).reset()[keys.CONTROLLED][0].tolist() == chosen.tolist()
 
 
 def test_agents_that_are_not_there_are_never_controlled() -> None:
     scene = crowd()
     scene.agents.valid[2, CURRENT_STEP] = False
-    assert choose_controlled(collate([scene]), 3)[0].nonzero()[:, 0].tolist() == [1, 4, 5]
+    assert choose_controlled(scene, 3).nonzero()[:, 0].tolist() == [1, 4, 5]
     assert TrafficEnv([scene]).num_agents == 5
 
 

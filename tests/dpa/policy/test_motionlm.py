@@ -90,7 +90,7 @@ def test_agents_that_are_not_valid_change_nothing(model: MotionLM, scene: Callab
     context, tokens = make_context(scene(4)), draw(4)
     alone = logits_of(model, keep_agents(context, torch.arange(3)), tokens[:, :, :3])
     context = context.clone()
-    context.valid[3] = context.controlled[3] = False
+    context.valid[3] = context.controlled[3] = context.logged_valid[3] = False
     context.recent[3], context.history[3] = 1e3, 7.0
     torch.testing.assert_close(logits_of(model, context, tokens)[:, :, :3], alone, **CLOSE)
 

@@ -1,0 +1,153 @@
+"""Who takes part in a simulation of a scene, and whom a policy moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from envs.scene import CURRENT_STEP, LOG_STEPS, STEP_SECONDS, Agents, Scene, SceneSource, select_agents
+
+MAX_CONTROLLED = 128
+"""Agents of one scene that a policy moves at most (WOSAC; SPEC section 1.2)."""
+
+ControlName = Literal["all", "sdc", "predict"]
+Control = ControlName | Callable[[Scene], Tensor]
+"""Whom a policy may move: everybody, the SDC, the tracks to predict, or a function that is given one uncollated scene
+with its present agents only and gives those agents as an ``[A]`` bool mask."""
+
+
+def check_control(control: Control) -> None:
+    """Refuse what is neither a name nor a function.
+
+    Raises:
+        ValueError: another name.
+    """
+    if not callable(control) and control not in get_args(ControlName):
+        raise ValueError(
+            f"control must be one of {list(get_args(ControlName))} or a function Scene -> [A] bool, got {control!r}."
+        )
+
+
+def simulated_agents(scene: Scene, *, arrivals: bool = False, last_step: int = LOG_STEPS - 1) -> Scene:
+    """One uncollated scene with the agents of a simulation only.
+
+    Those are the agents valid at the current step, in their order. Arrivals follow in their order: agents that are not
+    there at the current step but are logged by ``last_step``. Until they arrive their poses are carried back from the
+    first one at constant velocity, and are not valid.
+
+    Args:
+        scene: an uncollated scene.
+
+    Keyword Args:
+        arrivals: whether they take part.
+        last_step: of the episode, 0 to 90.
+
+    Examples:
+        >>> from envs.sources.synthetic import straight_road
+        >>> scene = straight_road(3)
+        >>> scene.agents.valid[0, :40] = False
+        >>> simulated_agents(scene).agents.track_id, simulated_agents(scene, arrivals=True).agents.track_id
+        (tensor([2, 3]), tensor([2, 3, 1]))
+    """
+    agents = scene.agents
+    present = agents.present.nonzero()[:, 0]
+    if not arrivals:
+        return select_agents(scene, present)
+    arrive = (~agents.present & agents.valid[:, CURRENT_STEP + 1 : last_step + 1].any(-1)).nonzero()[:, 0]
+    scene = select_agents(scene, torch.cat((present, arrive)))
+    _carry_back(scene.agents, slice(len(present), None))
+    return scene
+
+
+def _carry_back(agents: Agents, rows: slice) -> None:
+    """Write poses of arriving agents from the current step to their arrival, at constant velocity."""
+    valid = agents.valid[rows, CURRENT_STEP:]
+    if not len(valid):
+        return
+    steps = torch.arange(valid.shape[1], device=valid.device)
+    first = valid.int().argmax(-1)
+    before = (steps < first[:, None])[..., None]
+    at = (torch.arange(len(first), device=valid.device), CURRENT_STEP + first)
+    back = (first[:, None] - steps)[..., None] * STEP_SECONDS
+    # select_agents has copied these tensors, so nobody else sees the change
+    for value, rate in ((agents.position[rows], agents.velocity[rows][at]), (agents.heading[rows, :, None], None)):
+        held = value[at][:, None].expand(-1, len(steps), -1).clone()
+        if rate is not None:
+            held[..., :2] -= back * rate[:, None]
+        value[:, CURRENT_STEP:] = torch.where(before, held, value[:, CURRENT_STEP:])
+
+
+def largest_scene(scenes: SceneSource, *, arrivals: bool = False, last_step: int = LOG_STEPS - 1) -> int:
+    """The largest number of simulated agents of any scene; without arrivals, a store knows it without loading scenes.
+
+    Args:
+        scenes: where scenes come from.
+
+    Keyword Args:
+        arrivals: see :func:`simulated_agents`.
+        last_step: see :func:`simulated_agents`.
+    """
+    counts = None if arrivals else getattr(scenes, "num_agents", None)
+    if counts is None:
+        every = (scenes[index] for index in range(len(scenes)))
+        counts = [len(simulated_agents(s, arrivals=arrivals, last_step=last_step).agents.kind) for s in every]
+    return int(max(counts))
+
+
+def pad_agents(scene: Scene, missing: int) -> Scene:
+    """Append invalid agents to an uncollated scene."""
+    scene = scene.clone(recurse=False)
+    agents = scene.agents.clone(recurse=False)
+    for field in agents.__dataclass_fields__:
+        value = getattr(agents, field)
+        fill = -1 if field == "track_id" else 0
+        setattr(agents, field, torch.cat((value, value.new_full((missing, *value.shape[1:]), fill))))
+    scene.agents = agents
+    return scene
+
+
+def choose_controlled(scene: Scene, limit: int, control: Control = "all") -> Tensor:
+    """Which agents a policy moves: of those it may, evaluated agents first, then those nearest to the SDC.
+
+    Args:
+        scene: an uncollated scene; agents that are not there at the current step are never controlled.
+        limit: agents at most.
+        control: whom it may move.
+
+    Returns:
+        ``[A]`` bool.
+
+    Raises:
+        ValueError: a control function that gives something else than an ``[A]`` bool mask.
+
+    Examples:
+        >>> from envs.sources.synthetic import straight_road
+        >>> choose_controlled(straight_road(3), limit=1)
+        tensor([ True, False, False])
+        >>> choose_controlled(straight_road(3), limit=9, control=lambda scene: ~scene.agents.sdc)
+        tensor([False,  True,  True])
+    """
+    agents = scene.agents
+    eligible = _may_control(scene, control)
+    xy = agents.position[:, CURRENT_STEP, :2]
+    sdc = (xy * agents.sdc[:, None]).sum(0)
+    distance = (xy - sdc).norm(dim=-1) - agents.sdc * 2e6 - agents.predict * 1e6
+    rank = distance.masked_fill(~eligible, torch.inf).argsort(stable=True).argsort()
+    return eligible & (rank < limit)
+
+
+def _may_control(scene: Scene, control: Control) -> Tensor:
+    """``[A]`` bool: the present agents that control allows."""
+    agents = scene.agents
+    if not callable(control):
+        return {"all": agents.present, "sdc": agents.sdc, "predict": agents.predict}[control] & agents.present
+    mask, num = control(select_agents(scene, agents.present)), int(agents.present.sum())
+    if not isinstance(mask, Tensor) or mask.dtype != torch.bool or mask.shape != (num,):
+        got = f"{tuple(mask.shape)} {mask.dtype}" if isinstance(mask, Tensor) else repr(mask)
+        raise ValueError(
+            f"scene {scene.scene_id}: control must give a bool mask of its {num} present agents, got {got}."
+        )
+    return agents.present.masked_scatter(agents.present, mask)
