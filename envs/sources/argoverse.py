@@ -68,7 +68,7 @@ GROUND_STEPS = 5
 _LACKS = Lacks.HEIGHT | Lacks.SIZES | Lacks.LIGHTS | Lacks.SPEED_LIMITS
 
 LARGEST_PARQUET = 64 * 2**20
-LARGEST_MAP = 32 * 2**20
+LARGEST_MAP = 16 * 2**20
 LARGEST_DATA = 128 * 2**20
 """Bytes of a parquet file, of a map, and of a parquet file's columns once unpacked, beyond which it is refused; a
 scenario has about 0.3, 0.1 and 0.5 MB."""
