@@ -10,6 +10,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from dpa.policy.context import AGENT_FIELDS, ContextOptions, SceneContext, collate_contexts, make_context
 from dpa.policy.decoder import NodeCache, NodeInputs, SceneMemory
+from dpa.policy.execution import Execution
 from dpa.policy.motionlm import MotionLM
 from dpa.policy.sampling import Decoding, draw, rollout_noise
 from envs import keys
@@ -71,6 +72,7 @@ class MotionActor(TensorDictModuleBase):
         decoding: the distribution that tokens are drawn from; that of the model by default.
         seed: of the sampling.
         first_rollout: number of the first of the K rollouts, where others roll out the ones before.
+        execution: how the model is run; exactly by default.
 
     ``log_prob`` is that of the model itself, ``sampling_log_prob`` that of the distribution drawn from (0 for the most
     probable token, which ``ExplorationType.DETERMINISTIC`` takes).
@@ -96,13 +98,15 @@ class MotionActor(TensorDictModuleBase):
         decoding: Decoding | None = None,
         seed: int = 0,
         first_rollout: int = 0,
+        execution: Execution | None = None,
     ) -> None:
         super().__init__()
         self.in_keys = [keys.SCENE, keys.STEP, keys.RECENT, keys.VALID, keys.CONTROLLED, keys.KIND]
         self.out_keys = [keys.TOKEN, keys.LOG_PROB, keys.SAMPLING_LOG_PROB]
         self.model, self.contexts = model, contexts
         self.num_rollouts, self.first_rollout = num_rollouts, first_rollout
-        self.decoding = decoding or Decoding(top_p=1.0)
+        self.decoding, self.execution = decoding or Decoding(top_p=1.0), execution or Execution()
+        self._decoder = [self.execution.prepare(model.decoder)]  # in a list, so that it is no second child
         self._memory: SceneMemory | None = None
         self._cache: NodeCache | None = None
         self.set_seed(seed)
@@ -127,7 +131,8 @@ class MotionActor(TensorDictModuleBase):
         valid = tensordict[keys.VALID]
         masks = self._cache.start(step, valid)
         nodes = NodeInputs(recent, last, step[:, None].expand_as(last), tensordict[keys.KIND], valid)
-        return self.model.decoder(nodes, self._memory, masks, self._cache)
+        with self.execution.autocast(recent.device):
+            return self._decoder[0](nodes, self._memory, masks, self._cache)
 
     def set_seed(self, seed: int) -> None:
         """Seed the sampling anew: the rollouts that begin from now on are the first ones of this seed."""
@@ -152,7 +157,8 @@ class MotionActor(TensorDictModuleBase):
         # Padding depends on the scenes of a batch, so a change of some encodes all: rare, and cheap beside the episode.
         self._scenes[fresh] = scene.view(-1, self.num_rollouts)[:, 0][fresh]
         context = collate_contexts([self.contexts[i] for i in self._scenes.tolist()]).to(step.device)
-        self._memory = self.model.encode(pad_context(context, shape[1]))
+        with self.execution.autocast(step.device):
+            self._memory = self.model.encode(pad_context(context, shape[1]))
         self._draw_noise(begins.nonzero()[:, 0].tolist(), scene.tolist())
 
     def _allocate(self, shape: torch.Size, device: torch.device) -> None:

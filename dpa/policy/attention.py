@@ -112,15 +112,17 @@ class RelativeAttention(nn.Module):
 
     @staticmethod
     def _attend(query: Tensor, memory: KeyValues, mask: Tensor | None) -> Tensor:
-        return F.scaled_dot_product_attention(query, memory.keys, memory.values, attn_mask=mask, scale=1.0)
+        # Places relative to each other are differences of large numbers, which bfloat16 would lose.
+        with torch.autocast(query.device.type, enabled=False):
+            return F.scaled_dot_product_attention(query, memory.keys, memory.values, attn_mask=mask, scale=1.0)
 
     def _merge(self, seen: Tensor, pose: Tensor) -> Tensor:
         """Heads ``[B, H, m, D + 3]`` to ``[B, m, width]``, in the frames of the queries."""
         return self.out(self._back(seen[..., : self.dim], pose[:, None]).transpose(1, 2).flatten(2))
 
     def _split(self, x: Tensor, parts: int) -> tuple[Tensor, ...]:
-        """``[B, n, parts * width]`` to ``parts`` times ``[B, H, n, D]``."""
-        return tuple(x.unflatten(-1, (parts, self.heads, self.dim)).permute(2, 0, 3, 1, 4))
+        """``[B, n, parts * width]`` to ``parts`` times ``[B, H, n, D]``, in float32 whatever the layer gave."""
+        return tuple(x.float().unflatten(-1, (parts, self.heads, self.dim)).permute(2, 0, 3, 1, 4))
 
     def _blocks(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Vector part ``[..., blocks, 2]``, weight part ``[..., blocks]`` and the channels without geometry."""
@@ -149,7 +151,7 @@ class RelativeAttention(nn.Module):
 
     def _gaze(self, x: Tensor, pose: Tensor) -> Tensor:
         """``[B, H, m, 3]``: w * (c_x, c_y, 1) for a centre c in the scene's frame, in units of METRES."""
-        offset, width = self.gaze(x).unflatten(-1, (self.heads, 3)).transpose(1, 2).split((2, 1), -1)
+        offset, width = self.gaze(x).float().unflatten(-1, (self.heads, 3)).transpose(1, 2).split((2, 1), -1)
         precision = self.precision[:, None, None] * METRES**2 * width.exp()
         centre = pose[..., :2] / METRES + rotate(offset, pose[..., 2])
         return torch.cat((precision * centre, precision), -1)

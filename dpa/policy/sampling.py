@@ -15,6 +15,8 @@ from envs.seeding import make_generator
 class Decoding:
     """A sampling distribution made from that of the model: first the temperature, then top-k, then top-p.
 
+    Tokens of equal probability are kept or cut together.
+
     Attributes:
         top_p: keep the smallest set of tokens with at least this probability (nucleus); 1 keeps all.
         temperature: divides the logits.
@@ -45,22 +47,22 @@ class Decoding:
 
     def log_probs(self, logits: Tensor) -> Tensor:
         """Log-probabilities ``[..., V]`` of the distribution that is drawn from; minus infinity where nothing is."""
-        log_probs = (logits / self.temperature).log_softmax(-1)
+        log_probs = (logits if self.temperature == 1 else logits / self.temperature).log_softmax(-1)
         if self.top_p >= 1 and not self.top_k:
             return log_probs
-        kept = log_probs >= self._least(log_probs)
-        return log_probs.masked_fill(~kept, -torch.inf).log_softmax(-1)
+        least, mass = self._cut(log_probs)
+        return torch.where(log_probs >= least, log_probs - mass.log(), -torch.inf)
 
-    def _least(self, log_probs: Tensor) -> Tensor:
-        """``[..., 1]``: the least log-probability of a token that is kept."""
+    def _cut(self, log_probs: Tensor) -> tuple[Tensor, Tensor]:
+        """``[..., 1]`` each: the least log-probability of a token that is kept, and the probability of all that are."""
         ordered = _descending(log_probs)
-        if self.top_k:
-            ordered = ordered[..., : self.top_k]
-        mass = ordered.exp()
-        mass = mass / mass.sum(-1, keepdim=True)
+        reached = ordered.exp().cumsum(-1)
+        most = reached[..., : self.top_k or None]
         # A token is kept when those before it have not reached top_p yet; the first one always is.
-        count = (mass.cumsum(-1) - mass < self.top_p).sum(-1, keepdim=True).clamp(min=1)
-        return ordered.gather(-1, count - 1)
+        later = (most[..., :-1] < self.top_p * most[..., -1:]).sum(-1, keepdim=True)
+        least = ordered.gather(-1, later)
+        last = (ordered >= least).sum(-1, keepdim=True) - 1  # equals of the least one are kept as well
+        return least, reached.gather(-1, last)
 
 
 def _descending(values: Tensor) -> Tensor:
@@ -84,10 +86,10 @@ def draw(log_probs: Tensor, uniform: Tensor) -> Tensor:
         tensor(2)
     """
     reached = log_probs.float().exp().cumsum(-1)
-    passed = reached <= uniform[..., None] * reached[..., -1:]
-    # Rounding may pass the last token; those behind the last one of any probability are as far.
-    last = (reached < reached[..., -1:]).sum(-1)
-    return torch.minimum(passed.sum(-1), last)
+    most = reached[..., -1:]
+    # Rounding may reach the end, where tokens of no probability may follow the last one that has some.
+    place = torch.minimum(uniform[..., None] * most, most.nextafter(torch.zeros_like(most)))
+    return torch.searchsorted(reached, place, right=True)[..., 0]
 
 
 def rollout_noise(seed: int, scene_id: str, rollout: int, episode: int, shape: tuple[int, int]) -> Tensor:

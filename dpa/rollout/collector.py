@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torchrl.collectors import BaseCollector
 
 from dpa.policy.context import ContextOptions
+from dpa.policy.execution import Execution
 from dpa.policy.motionlm import MotionLM
 from dpa.policy.sampling import Decoding
 from dpa.rollout.crew import Crew, Outcome, Workers, hire
@@ -179,6 +180,7 @@ def make_collector(
     workers: Workers | None = None,
     memory: float = 1.0,
     device: torch.device | str = "cpu",
+    execution: Execution | None = None,
 ) -> RolloutCollector:
     """Roll all scenes out, each K times: a TorchRL collector, in this process, in several, or on a Ray cluster.
 
@@ -200,6 +202,7 @@ def make_collector(
         workers: who does it; this process by default.
         memory: budget of each worker for rollouts [GiB]; a crowded scene is rolled out in pieces.
         device: of environment and policy.
+        execution: how the model is run; exactly by default.
 
     Examples:
         >>> from dpa.tokens import VerletTokenizer
@@ -211,7 +214,17 @@ def make_collector(
         ([1, 1, 1, 1], torch.Size([4, 16, 9]))
     """
     options = options or ContextOptions()
-    job = RolloutJob(scenes, model, num_rollouts, decoding or Decoding(), options, seed, make_postproc, device)
+    job = RolloutJob(
+        scenes,
+        model,
+        num_rollouts,
+        decoding=decoding or Decoding(),
+        options=options,
+        seed=seed,
+        make_postproc=make_postproc,
+        device=device,
+        execution=execution or Execution(),
+    )
     tasks = plan_tasks(agents_of(scenes, indices), num_rollouts, rows_within(memory, model, options), done)
     return RolloutCollector(job, tasks, workers)
 

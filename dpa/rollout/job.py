@@ -13,6 +13,7 @@ from torchrl.envs import TransformedEnv
 
 from dpa.policy.actor import Contexts, MotionActor
 from dpa.policy.context import ContextOptions
+from dpa.policy.execution import Execution
 from dpa.policy.motionlm import MotionLM
 from dpa.policy.sampling import Decoding
 from dpa.rollout.plan import RolloutTask
@@ -64,6 +65,7 @@ class RolloutJob:
         make_postproc: makes the post-processing of a task from its scenes, for instance
             :class:`~dpa.ranking.RankRollouts`; applied to the whole rollouts ``[S * K, T]`` of the task.
         device: of environment and policy.
+        execution: how the model is run.
     """
 
     scenes: SceneSource
@@ -74,6 +76,7 @@ class RolloutJob:
     seed: int = 0
     make_postproc: Callable[[SceneSource], PostProcess] | None = None
     device: torch.device | str = "cpu"
+    execution: Execution = field(default_factory=Execution)
 
 
 class RolloutWorker:
@@ -133,6 +136,7 @@ class RolloutWorker:
             decoding=job.decoding,
             seed=job.seed,
             first_rollout=piece.start,
+            execution=job.execution,
         )
         frames = len(part) * len(piece) * options.horizon
         collector = Collector(

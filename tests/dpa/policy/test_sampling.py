@@ -52,6 +52,13 @@ def test_nothing_is_cut_from_the_whole_distribution() -> None:
     assert torch.equal(Decoding(top_p=1.0).log_probs(logits), logits.log_softmax(-1))
 
 
+@pytest.mark.parametrize("decoding", [Decoding(top_p=0.5), Decoding(top_p=1.0, top_k=3), Decoding(top_p=0.5, top_k=2)])
+def test_tokens_of_equal_probability_are_kept_or_cut_together(decoding: Decoding) -> None:
+    probs = torch.tensor([0.2, 0.05, 0.2, 0.2, 0.1, 0.2, 0.05])
+    kept = torch.tensor([0.25, 0.0, 0.25, 0.25, 0.0, 0.25, 0.0])
+    torch.testing.assert_close(decoding.log_probs(probs.log()).exp(), kept)
+
+
 def test_draws_have_the_frequencies_of_the_distribution() -> None:
     probs = torch.tensor([0.1, 0.0, 0.6, 0.3, 0.0])
     drawn = draw(probs.log().expand(100_000, -1), torch.rand(100_000, generator=torch.Generator().manual_seed(0)))
