@@ -21,6 +21,7 @@ from envs.sources.sumo import parse, units
 from recipes.align import LOSSES
 from recipes.benchmark.__main__ import make_parser as benchmark_parser
 from recipes.models import TOKENIZERS
+from recipes.plan import make_parser as plan_parser
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 CONFIG = REPOSITORY / "recipes" / "config"
@@ -131,8 +132,14 @@ def test_a_benchmark_takes_the_options_that_a_command_gives(command: str) -> Non
     assert benchmark_parser().parse_args(shlex.split(command)[1:]).part in command
 
 
+@pytest.mark.parametrize("command", [command for command in COMMANDS if command.startswith("recipes.plan ")])
+def test_a_plan_takes_the_options_that_a_command_gives(command: str) -> None:
+    assert plan_parser().parse_args(shlex.split(command)[1:]).rollout.suffix == ".json"
+
+
 @pytest.mark.parametrize(
-    "command", [c for c in COMMANDS if c.startswith("recipes.") and not c.startswith("recipes.benchmark")]
+    "command",
+    [c for c in COMMANDS if c.startswith("recipes.") and not c.startswith(("recipes.benchmark", "recipes.plan"))],
 )
 def test_a_recipe_takes_the_options_that_a_command_gives(command: str, extra_configurations: Path) -> None:
     module, *arguments = shlex.split(command)

@@ -147,6 +147,7 @@ class RolloutWorker:
             auto_register_policy_transforms=False,
             track_traj_ids=False,
             trust_policy=True,
+            use_buffers=False,  # buffers are made by trying the policy out, which costs as much as a decision
             device=job.device,
         )
         try:

@@ -13,6 +13,7 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -23,12 +24,15 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 from torchrl.envs import TransformedEnv
 
+from dpa.losses import NextTokenLoss, token_network
 from dpa.policy import SIZES, Decoding, MotionActor, MotionLM
 from dpa.policy.actor import Contexts, pad_context
-from dpa.policy.context import collate_contexts
+from dpa.policy.context import collate_contexts, make_context
+from dpa.ranking.transform import RankRollouts
 from dpa.rollout import RolloutTask, RolloutWorker
 from dpa.rollout.job import RolloutJob
 from dpa.tokens import TokenAction, VerletTokenizer
+from dpa.training.batches import collate_items, log_item
 from envs import keys
 from envs.allocator import keep_freed_memory
 from envs.progress import progress
@@ -39,6 +43,8 @@ from recipes.benchmark.realism import crowded_scene
 KIB_PER_GIB = 1 << 20
 SEGMENTS = 5000
 """Of the road edges of a scene: more than the policy's map pieces, as in WOMD."""
+TRAINED_SCENES = 4
+"""Of a step of pre-training."""
 MATRIX = 1024
 """Rows and columns of the product that the limit is measured with."""
 
@@ -49,7 +55,8 @@ class Case:
 
     Attributes:
         how: ``incremental`` is the bare loop with a cache, ``naive`` the one that encodes all anew for each decision,
-            ``collector`` the collector that recipes use.
+            ``collector`` the collector that recipes use, ``ranked`` the same with the ranking behind it, ``trained`` a
+            step of pre-training on the scenes' logs.
         agents: of each scene, all controlled.
         rollouts: of each scene.
         scenes: side by side.
@@ -70,8 +77,8 @@ class Case:
 
     @property
     def agent_steps(self) -> int:
-        """Of one episode: 80 steps of 0.1 s of every agent of every rollout."""
-        return self.agents * self.rollouts * self.scenes * 80
+        """Of one episode: 80 steps of 0.1 s of every agent of every rollout, or of every log that is trained on."""
+        return self.agents * (1 if self.how == "trained" else self.rollouts) * self.scenes * 80
 
 
 class NaiveActor(MotionActor):
@@ -111,13 +118,14 @@ def add_options(part: argparse.ArgumentParser) -> None:
 def measure(options: dict[str, Any]) -> list[dict[str, Any]]:
     """Run the part and print its tables."""
     main = Case("incremental", **{key: value for key, value in options.items() if key != "sweep"})
-    cases = [main, replace(main, how="collector"), replace(main, how="naive")]
+    cases = [replace(main, how=how) for how in ("incremental", "collector", "naive", "ranked")]
+    cases += [replace(main, how="trained", scenes=TRAINED_SCENES)]
     if options["sweep"]:
         cases += sweep(main)
     rows = [asdict(case) | _apart(case) for case in progress(cases, "rollout", unit="case")]
-    _print(rows[:3], f"rollouts, {main.size} model, {main.device}, {main.threads} threads")
+    _print(rows[:5], f"rollouts, {main.size} model, {main.device}, {main.threads} threads")
     if options["sweep"]:
-        _print(rows[3:], "growth")
+        _print(rows[5:], "growth")
     limit = _limit(main, rows[0])
     Console(width=110).print(_facts(rows, limit))
     return [*rows, limit]
@@ -141,7 +149,8 @@ def run(case: Case) -> dict[str, float]:
     torch.manual_seed(0)
     model = MotionLM(case.size, VerletTokenizer()).to(case.device).eval()
     scenes = [crowded_scene(case.agents, SEGMENTS, seed=index) for index in range(case.scenes)]
-    episode = _collected(case, model, scenes) if case.how == "collector" else _bare(case, model, scenes)
+    make = {"collector": _collected, "ranked": _collected, "trained": _trained}.get(case.how, _bare)
+    episode = make(case, model, scenes)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     seconds = statistics.median([_timed(episode, case.device) for _ in range(case.repeats + 1)][1:])
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
@@ -166,9 +175,18 @@ def _bare(case: Case, model: MotionLM, scenes: list[Scene]) -> Callable[[], obje
 
 def _collected(case: Case, model: MotionLM, scenes: list[Scene]) -> Callable[[], object]:
     """What recipes do: environment, policy and collector made anew for each task."""
-    worker = RolloutWorker(RolloutJob(scenes, model, case.rollouts, device=case.device))
+    rank = partial(RankRollouts, num_rollouts=case.rollouts) if case.how == "ranked" else None
+    worker = RolloutWorker(RolloutJob(scenes, model, case.rollouts, device=case.device, make_postproc=rank))
     task = RolloutTask(tuple(range(case.scenes)), (range(case.rollouts),))
     return lambda: worker.run(task)
+
+
+def _trained(case: Case, model: MotionLM, scenes: list[Scene]) -> Callable[[], object]:
+    """Loss and gradients of the logs of all scenes."""
+    loss = NextTokenLoss(token_network(model.train()))
+    tokenizer = VerletTokenizer()
+    batch = collate_items([log_item(make_context(scene), tokenizer) for scene in scenes]).to(case.device)
+    return lambda: sum(value for key, value in loss(batch).items() if key.startswith("loss_")).backward()
 
 
 def _timed(work: Callable[[], object], device: str) -> float:

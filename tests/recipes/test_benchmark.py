@@ -6,10 +6,19 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
+from torchrl.envs import TransformedEnv
 
+from dpa.policy import MotionActor, MotionLM
+from dpa.policy.actor import Contexts
+from dpa.tokens import TokenAction, VerletTokenizer
+from envs import keys
 from envs.sources.tfrecord import frame
+from envs.traffic import TrafficEnv
 from recipes.benchmark.__main__ import main
 from recipes.benchmark.realism import crowded_scene, noisy_log
+from recipes.benchmark.rollout import NaiveActor
+from recipes.plan import main as plan_main
 
 
 def test_a_crowded_scene_has_the_agents_and_edges_that_were_asked_for() -> None:
@@ -48,3 +57,43 @@ def test_scenes_are_measured_raw_and_stored(make_scenario, tmp_path: Path, capsy
     assert figures["conversion with 1 processes, start included"] > 0
     assert "scenes of womd, 6 in all" in capsys.readouterr().out
     assert not list(work.iterdir())
+
+
+def test_rollouts_are_measured_and_planned_with(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, plan = tmp_path / "rollout.json", tmp_path / "plan.json"
+    small = ["--size", "nano", "--agents", "2", "--rollouts", "2", "--threads", "1", "--repeats", "1"]
+    assert main(["rollout", *small, "--json", str(out)]) == 0
+    assert "incremental over naive" in capsys.readouterr().out
+    *rows, limit = json.loads(out.read_text())["rows"]
+    assert [row["how"] for row in rows] == ["incremental", "collector", "naive", "ranked", "trained"]
+    assert all(row["agent_steps_per_second"] > 0 for row in rows)
+    assert 0 < limit["fraction_reached"] < 1
+    assert plan_main([str(out), "--workers", "4", "--json", str(plan)]) == 0
+    assert "grows with" in capsys.readouterr().out
+    hours = {part["name"]: part["hours"] for part in json.loads(plan.read_text())["parts"]}
+    assert hours["collect and rank"] == pytest.approx(
+        487_000 * 64 * 50 * 80 / rows[3]["agent_steps_per_second"] / 4 / 3600
+    )
+
+
+def test_the_naive_decoder_decodes_the_same() -> None:
+    """It is what the other one is measured against, so it must do the same work."""
+    torch.manual_seed(0)
+    model, scenes = MotionLM("nano", VerletTokenizer()).eval(), [crowded_scene(3, 100), crowded_scene(2, 100)]
+    found = []
+    for kind in (MotionActor, NaiveActor):
+        env = TransformedEnv(TrafficEnv(scenes, num_scenes=2, num_rollouts=2), TokenAction(model.tokenizer))
+        found.append(env.rollout(16, kind(model, Contexts(scenes), num_rollouts=2)))
+    controlled = found[0][keys.CONTROLLED]
+    assert torch.equal(*(rollout[keys.TOKEN][controlled] for rollout in found))
+    log_probs = (rollout[keys.LOG_PROB][controlled] for rollout in found)
+    torch.testing.assert_close(*log_probs, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "content", ["{", "[]", '{"rows": [{"how": "naive", "agent_steps_per_second": 1}], "options": {}}']
+)
+def test_a_plan_without_rates_is_refused(content: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "rates.json").write_text(content)
+    assert plan_main([str(tmp_path / "rates.json")]) == 2
+    assert "rates.json" in capsys.readouterr().err
