@@ -15,7 +15,7 @@ from pathlib import Path
 import hydra
 from omegaconf import DictConfig
 
-from dpa.policy import Decoding, Execution
+from dpa.policy import Decoding
 from dpa.preferences import PreferenceStore, PreferenceWriter, Provenance, data_card
 from dpa.ranking import PreferenceDistance
 from dpa.ranking.transform import RankRollouts
@@ -66,7 +66,7 @@ def collect(cfg: DictConfig, scenes: SceneStore, policy: Path, seed: int, folder
                 workers=build(Workers, options.workers, "collection.workers"),
                 memory=options.memory,
                 device=cfg.device,
-                execution=build(Execution, options.execution, "collection.execution"),
+                precision=options.precision,
             ):
                 groups = groups[[scene not in done for scene in groups[keys.SCENE].tolist()]]
                 writer.append(groups)

@@ -2,7 +2,6 @@
 
 from dpa.policy.actor import MotionActor
 from dpa.policy.context import ContextOptions, SceneContext, collate_contexts, make_context
-from dpa.policy.execution import Execution
 from dpa.policy.motionlm import SIZES, MotionLM, MotionLMConfig
 from dpa.policy.sampling import Decoding
 
@@ -10,7 +9,6 @@ __all__ = [
     "SIZES",
     "ContextOptions",
     "Decoding",
-    "Execution",
     "MotionActor",
     "MotionLM",
     "MotionLMConfig",

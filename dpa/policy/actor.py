@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal, get_args
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -10,11 +12,23 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from dpa.policy.context import AGENT_FIELDS, ContextOptions, SceneContext, collate_contexts, make_context
 from dpa.policy.decoder import NodeCache, NodeInputs, SceneMemory
-from dpa.policy.execution import Execution
 from dpa.policy.motionlm import MotionLM
 from dpa.policy.sampling import Decoding, draw, rollout_noise
 from envs import keys
 from envs.scene import SceneSource
+
+Precision = Literal["float32", "bfloat16"]
+
+
+def check_precision(precision: str) -> Precision:
+    """Give the precision back.
+
+    Raises:
+        ValueError: it is none that a policy runs in.
+    """
+    if precision not in get_args(Precision):
+        raise ValueError(f"precision must be one of {', '.join(get_args(Precision))}, got {precision!r}.")
+    return precision
 
 
 class Contexts:
@@ -72,7 +86,11 @@ class MotionActor(TensorDictModuleBase):
         decoding: the distribution that tokens are drawn from; that of the model by default.
         seed: of the sampling.
         first_rollout: number of the first of the K rollouts, where others roll out the ones before.
-        execution: how the model is run; exactly by default.
+        precision: ``"bfloat16"`` runs linear layers in bfloat16 (autocast), for GPUs; attention, which holds places
+            relative to each other as differences of large numbers, stays in float32. ``"float32"`` is exact.
+
+    Raises:
+        ValueError: an unknown precision.
 
     ``log_prob`` is that of the model itself, ``sampling_log_prob`` that of the distribution drawn from (0 for the most
     probable token, which ``ExplorationType.DETERMINISTIC`` takes).
@@ -98,15 +116,14 @@ class MotionActor(TensorDictModuleBase):
         decoding: Decoding | None = None,
         seed: int = 0,
         first_rollout: int = 0,
-        execution: Execution | None = None,
+        precision: Precision = "float32",
     ) -> None:
         super().__init__()
         self.in_keys = [keys.SCENE, keys.STEP, keys.RECENT, keys.VALID, keys.CONTROLLED, keys.KIND]
         self.out_keys = [keys.TOKEN, keys.LOG_PROB, keys.SAMPLING_LOG_PROB]
         self.model, self.contexts = model, contexts
         self.num_rollouts, self.first_rollout = num_rollouts, first_rollout
-        self.decoding, self.execution = decoding or Decoding(top_p=1.0), execution or Execution()
-        self._decoder = [self.execution.prepare(model.decoder)]  # in a list, so that it is no second child
+        self.decoding, self.precision = decoding or Decoding(top_p=1.0), check_precision(precision)
         self._memory: SceneMemory | None = None
         self._cache: NodeCache | None = None
         self.set_seed(seed)
@@ -131,13 +148,16 @@ class MotionActor(TensorDictModuleBase):
         valid = tensordict[keys.VALID]
         masks = self._cache.start(step, valid)
         nodes = NodeInputs(recent, last, step[:, None].expand_as(last), tensordict[keys.KIND], valid)
-        with self.execution.autocast(recent.device):
-            return self._decoder[0](nodes, self._memory, masks, self._cache)
+        with self._autocast(recent.device):
+            return self.model.decoder(nodes, self._memory, masks, self._cache)
 
     def set_seed(self, seed: int) -> None:
         """Seed the sampling anew: the rollouts that begin from now on are the first ones of this seed."""
         self.seed = seed
         self._begun: dict[tuple[int, int], int] = {}
+
+    def _autocast(self, device: torch.device) -> torch.autocast:
+        return torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
 
     # --- the start of episodes --------------------------------------------------------------------------------------
     def _start(self, scene: Tensor, step: Tensor, shape: torch.Size) -> None:
@@ -157,7 +177,7 @@ class MotionActor(TensorDictModuleBase):
         # Padding depends on the scenes of a batch, so a change of some encodes all: rare, and cheap beside the episode.
         self._scenes[fresh] = scene.view(-1, self.num_rollouts)[:, 0][fresh]
         context = collate_contexts([self.contexts[i] for i in self._scenes.tolist()]).to(step.device)
-        with self.execution.autocast(step.device):
+        with self._autocast(step.device):
             self._memory = self.model.encode(pad_context(context, shape[1]))
         self._draw_noise(begins.nonzero()[:, 0].tolist(), scene.tolist())
 

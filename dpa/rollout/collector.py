@@ -13,8 +13,8 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.collectors import BaseCollector
 
+from dpa.policy.actor import Precision
 from dpa.policy.context import ContextOptions
-from dpa.policy.execution import Execution
 from dpa.policy.motionlm import MotionLM
 from dpa.policy.sampling import Decoding
 from dpa.rollout.crew import Crew, Outcome, Workers, hire
@@ -180,7 +180,7 @@ def make_collector(
     workers: Workers | None = None,
     memory: float = 1.0,
     device: torch.device | str = "cpu",
-    execution: Execution | None = None,
+    precision: Precision = "float32",
 ) -> RolloutCollector:
     """Roll all scenes out, each K times: a TorchRL collector, in this process, in several, or on a Ray cluster.
 
@@ -202,7 +202,7 @@ def make_collector(
         workers: who does it; this process by default.
         memory: budget of each worker for rollouts [GiB]; a crowded scene is rolled out in pieces.
         device: of environment and policy.
-        execution: how the model is run; exactly by default.
+        precision: of the policy's linear layers: ``"bfloat16"`` is for GPUs.
 
     Examples:
         >>> from dpa.tokens import VerletTokenizer
@@ -223,7 +223,7 @@ def make_collector(
         seed=seed,
         make_postproc=make_postproc,
         device=device,
-        execution=execution or Execution(),
+        precision=precision,
     )
     tasks = plan_tasks(agents_of(scenes, indices), num_rollouts, rows_within(memory, model, options), done)
     return RolloutCollector(job, tasks, workers)

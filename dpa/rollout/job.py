@@ -11,9 +11,8 @@ from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 
-from dpa.policy.actor import Contexts, MotionActor
+from dpa.policy.actor import Contexts, MotionActor, Precision, check_precision
 from dpa.policy.context import ContextOptions
-from dpa.policy.execution import Execution
 from dpa.policy.motionlm import MotionLM
 from dpa.policy.sampling import Decoding
 from dpa.rollout.plan import RolloutTask
@@ -63,9 +62,9 @@ class RolloutJob:
         options: how scenes are cut up; also the horizon and the controlled agents.
         seed: of the sampling.
         make_postproc: makes the post-processing of a task from its scenes, for instance
-            :class:`~dpa.ranking.RankRollouts`; applied to the whole rollouts ``[S * K, T]`` of the task.
+            :class:`~dpa.ranking.transform.RankRollouts`; applied to the whole rollouts ``[S * K, T]`` of the task.
         device: of environment and policy.
-        execution: how the model is run.
+        precision: of the policy's linear layers, see :class:`~dpa.policy.MotionActor`.
     """
 
     scenes: SceneSource
@@ -76,7 +75,10 @@ class RolloutJob:
     seed: int = 0
     make_postproc: Callable[[SceneSource], PostProcess] | None = None
     device: torch.device | str = "cpu"
-    execution: Execution = field(default_factory=Execution)
+    precision: Precision = "float32"
+
+    def __post_init__(self) -> None:
+        check_precision(self.precision)
 
 
 class RolloutWorker:
@@ -136,7 +138,7 @@ class RolloutWorker:
             decoding=job.decoding,
             seed=job.seed,
             first_rollout=piece.start,
-            execution=job.execution,
+            precision=job.precision,
         )
         frames = len(part) * len(piece) * options.horizon
         collector = Collector(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import pytest
@@ -13,7 +12,7 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from dpa.policy import ContextOptions, Execution, MotionActor, MotionLM, collate_contexts
+from dpa.policy import ContextOptions, MotionActor, MotionLM, collate_contexts
 from dpa.policy.actor import Contexts, pad_context
 from dpa.policy.sampling import Decoding
 from dpa.tokens import TokenAction
@@ -215,30 +214,16 @@ def test_a_tiny_nucleus_is_the_most_probable_token(model: MotionLM, scenes: list
 @torch.no_grad()
 def test_bfloat16_changes_the_distribution_by_little(model: MotionLM, scenes: list[Scene]) -> None:
     env, exact = drive(model, scenes)
-    rounded = drive(model, scenes, execution=Execution("bfloat16"))[1]
+    rounded = drive(model, scenes, precision="bfloat16")[1]
     state = env.reset()
     before, after = (actor.logits(state).float()[state[keys.CONTROLLED]].log_softmax(-1) for actor in (exact, rounded))
     assert not torch.equal(before, after)
     assert (before.exp() * (before - after)).sum(-1).abs().max() < 1e-3
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of torch, about itself
-def test_a_traced_decoder_gives_the_same_rollouts(
-    model: MotionLM, scenes: list[Scene], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Traced as for compilation, which itself takes minutes, and run as traced."""
-    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
-    env, actor = drive(model, scenes, execution=Execution(compile=True))
-    rollout = env.rollout(16, actor)
-    assert_as_teacher_forced(model, scenes, rollout)
-    env, actor = drive(model, scenes)
-    assert torch.equal(env.rollout(16, actor)[keys.TOKEN], rollout[keys.TOKEN])
-
-
-def test_an_unknown_precision_is_refused() -> None:
-    with pytest.raises(ValueError, match="precision must be float32 or bfloat16, got 'float8'"):
-        Execution("float8")
+def test_an_unknown_precision_is_refused(model: MotionLM) -> None:
+    with pytest.raises(ValueError, match="precision must be one of float32, bfloat16, got 'float8'"):
+        MotionActor(model, Contexts([straight_road()]), precision="float8")
 
 
 # --- errors ---------------------------------------------------------------------------------------------------------
