@@ -138,6 +138,22 @@ def test_collecting_goes_on_where_it_stopped_even_inside_a_group(
     assert order[0] == order[1]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["process", "ray"])
+def test_workers_fill_the_same_store_byte_for_byte(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path, backend: str
+) -> None:
+    if backend == "ray":
+        ray = pytest.importorskip("ray")
+    workers = ["collection.workers.count=2", f"collection.workers.backend={backend}", "collection.workers.threads=1"]
+    try:
+        assert run("collect", *collect_into(tmp_path / "preferences", runs, options), *workers).status == 0
+    finally:
+        if backend == "ray":
+            ray.shutdown()
+    assert contents(tmp_path / "preferences") == contents(runs / "preferences")
+
+
 def test_collecting_again_adds_nothing(run: Callable, options: Callable, runs: Path) -> None:
     before = contents(runs / "preferences")
     outcome = run("collect", *collect_into(runs / "preferences", runs, options))
