@@ -12,10 +12,10 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from dpa.policy import ContextOptions, MotionActor, MotionLM, collate_contexts
+from dpa.policy import SIZES, ContextOptions, MotionActor, MotionLM, collate_contexts
 from dpa.policy.actor import Contexts, pad_context
 from dpa.policy.sampling import Decoding
-from dpa.tokens import TokenAction
+from dpa.tokens import TokenAction, VerletTokenizer
 from envs import keys
 from envs.scene import Scene
 from envs.sources.synthetic import straight_road
@@ -63,6 +63,17 @@ def test_cached_log_probs_equal_those_of_one_teacher_forced_pass(model: MotionLM
     rollout = env.rollout(16, actor)
     assert (~rollout[keys.CONTROLLED] & rollout[keys.VALID]).any(), "some agents follow their logs"
     assert_as_teacher_forced(model, scenes, rollout)
+
+
+@pytest.mark.parametrize("size", sorted(SIZES))
+@pytest.mark.parametrize("tokenizer", [{}, {"interpolation": "linear"}, {"frame": "scene"}])
+def test_the_cache_is_right_for_every_size_and_tokenizer(
+    size: str, tokenizer: dict[str, str], scenes: list[Scene]
+) -> None:
+    torch.manual_seed(0)
+    model = MotionLM(size, VerletTokenizer(**tokenizer)).eval()
+    env, actor = drive(model, scenes)
+    assert_as_teacher_forced(model, scenes, env.rollout(16, actor))
 
 
 def test_the_cache_is_right_episode_after_episode(model: MotionLM, scenes: list[Scene]) -> None:
