@@ -16,10 +16,12 @@ import hydra
 from omegaconf import DictConfig
 
 from dpa.policy import Decoding
+from dpa.policy.actor import check_precision
 from dpa.preferences import PreferenceStore, PreferenceWriter, Provenance, data_card
 from dpa.ranking import PreferenceDistance
 from dpa.ranking.transform import RankRollouts
 from dpa.rollout import Workers, make_collector
+from dpa.rollout.collector import rows_within
 from envs import keys
 from envs.progress import progress
 from envs.store import SceneStore
@@ -41,6 +43,11 @@ def collect(cfg: DictConfig, scenes: SceneStore, policy: Path, seed: int, folder
     options = cfg.collection
     model, context, _ = open_policy(policy, cfg.device)
     distance = build(PreferenceDistance, options.ranking, "collection.ranking")
+    # What is wrong with an option is told before a store is begun with it.
+    decoding = build(Decoding, options.decoding, "collection.decoding")
+    workers = build(Workers, options.workers, "collection.workers")
+    check_precision(options.precision)
+    rows_within(options.memory, model, context)
     provenance = Provenance(
         policy=weights_digest(model),
         scenes=fingerprint(scenes),
@@ -59,11 +66,11 @@ def collect(cfg: DictConfig, scenes: SceneStore, policy: Path, seed: int, folder
                 model,
                 num_rollouts=options.num_rollouts,
                 done=done,
-                decoding=build(Decoding, options.decoding, "collection.decoding"),
+                decoding=decoding,
                 options=context,
                 seed=seed,
                 make_postproc=partial(RankRollouts, num_rollouts=options.num_rollouts, distance=distance),
-                workers=build(Workers, options.workers, "collection.workers"),
+                workers=workers,
                 memory=options.memory,
                 device=cfg.device,
                 precision=options.precision,

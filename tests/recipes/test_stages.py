@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -152,6 +153,23 @@ def test_workers_fill_the_same_store_byte_for_byte(
         if backend == "ray":
             ray.shutdown()
     assert contents(tmp_path / "preferences") == contents(runs / "preferences")
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("collection.workers.count=2", "2 workers need backend=process or backend=ray"),
+        ("collection.memory=0", "memory must hold at least one agent, got 0 GiB"),
+        ("collection.precision=float16", "precision must be one of float32, bfloat16, got 'float16'"),
+        ("collection.decoding.top_k=-1", "top_k must be 0 .all tokens. or more, got -1"),
+    ],
+)
+def test_a_wrong_option_is_told_before_a_store_is_begun(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path, option: str, message: str
+) -> None:
+    outcome = run("collect", *collect_into(tmp_path / "preferences", runs, options), option)
+    assert outcome.status == 2 and re.search(message, outcome.err)
+    assert not (tmp_path / "preferences").exists()
 
 
 def test_collecting_again_adds_nothing(run: Callable, options: Callable, runs: Path) -> None:
