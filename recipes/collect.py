@@ -74,6 +74,7 @@ def collect(cfg: DictConfig, scenes: SceneStore, policy: Path, seed: int, folder
                 memory=options.memory,
                 device=cfg.device,
                 precision=options.precision,
+                compile=options.compile,
             ):
                 groups = groups[[scene not in done for scene in groups[keys.SCENE].tolist()]]
                 writer.append(groups)

@@ -87,7 +87,7 @@ class RelativeAttention(nn.Module):
         pose = pose[:, None]
         xy = (pose[..., :2] / METRES).expand(*key.shape[:-1], 2)
         window = torch.cat((xy, -(xy[..., :1] ** 2 + xy[..., 1:] ** 2) / 2), -1)
-        return KeyValues(torch.cat((self._move(key, pose), window), -1), F.pad(self._move(value, pose), (0, 3)))
+        return KeyValues(self._move(key, pose, window), self._move(value, pose, torch.zeros_like(window)))
 
     def forward(self, x: Tensor, pose: Tensor, memory: KeyValues, mask: Tensor | None = None) -> Tensor:
         """Attend from tokens to remembered ones.
@@ -108,7 +108,7 @@ class RelativeAttention(nn.Module):
         """``[B, H, m, D + 3]``."""
         (query,) = self._split(self.query(x), 1)
         pose = pose[:, None]
-        return torch.cat((self._query(query, pose), self._gaze(x, pose)), -1)
+        return self._query(query, pose, self._gaze(x, pose))
 
     @staticmethod
     def _attend(query: Tensor, memory: KeyValues, mask: Tensor | None) -> Tensor:
@@ -129,19 +129,22 @@ class RelativeAttention(nn.Module):
         vector, weight, rest = x.split((2 * self.blocks, self.blocks, self.dim - 3 * self.blocks), -1)
         return vector.unflatten(-1, (self.blocks, 2)), weight, rest
 
-    def _move(self, x: Tensor, pose: Tensor) -> Tensor:
-        """Multiply by rho(g): turn the vectors and shift them by weight times position."""
+    def _move(self, x: Tensor, pose: Tensor, more: Tensor) -> Tensor:
+        """Multiply by rho(g): turn the vectors and shift them by weight times position; then ``more`` channels."""
         vector, weight, rest = self._blocks(x)
         vector = rotate(vector, pose[..., 2:]) + weight[..., None] * pose[..., None, :2] / METRES
-        return torch.cat((vector.flatten(-2), weight, rest), -1)
+        return torch.cat((vector.flatten(-2), weight, rest, more), -1)
 
-    def _query(self, x: Tensor, pose: Tensor) -> Tensor:
-        """Multiply by rho(g)^-T, scaled as in dot-product attention, so that q . k = x^T rho(g_i^-1 g_j) key."""
+    def _query(self, x: Tensor, pose: Tensor, more: Tensor) -> Tensor:
+        """Multiply by rho(g)^-T, scaled as in dot-product attention, so that q . k = x^T rho(g_i^-1 g_j) key.
+
+        ``more`` channels follow.
+        """
         vector, weight, rest = self._blocks(x * self.dim**-0.5)
         vector = rotate(vector, pose[..., 2:])
         x, y = vector.unbind(-1)
         weight = weight - (x * pose[..., :1] + y * pose[..., 1:2]) / METRES
-        return torch.cat((vector.flatten(-2), weight, rest), -1)
+        return torch.cat((vector.flatten(-2), weight, rest, more), -1)
 
     def _back(self, x: Tensor, pose: Tensor) -> Tensor:
         """Multiply by rho(g)^-1: what was seen, in the frame of the query."""
@@ -193,7 +196,12 @@ class NodeAttention(RelativeAttention):
         Returns:
             ``[B, m, width]``.
         """
-        query = self._queries(x, pose)
+        seen = self._look(self._queries(x, pose), memory, masks, agents)
+        return self._merge(seen, pose)
+
+    @torch.compiler.disable  # torch 2.13 compiles attention over a part of the heads to wrong numbers on a CPU
+    def _look(self, query: Tensor, memory: KeyValues, masks: NodeMasks, agents: int) -> Tensor:
+        """``[B, H, m, D + 3]``: the own past in the first heads, everybody in the rest."""
         rest = KeyValues(memory.keys[:, self.own :], memory.values[:, self.own :])
         everybody = self._attend(query[:, self.own :], rest, masks.everybody)
 
@@ -203,8 +211,8 @@ class NodeAttention(RelativeAttention):
 
         past = KeyValues(by_agent(memory.keys), by_agent(memory.values))
         own = self._attend(by_agent(query), past, masks.own)
-        own = own.unflatten(0, (len(x), agents)).permute(0, 2, 3, 1, 4).flatten(2, 3)
-        return self._merge(torch.cat((own, everybody), 1), pose)
+        own = own.unflatten(0, (len(query), agents)).permute(0, 2, 3, 1, 4).flatten(2, 3)
+        return torch.cat((own, everybody), 1)
 
 
 class FeedForward(nn.Sequential):

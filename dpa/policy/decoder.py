@@ -224,6 +224,7 @@ class NodeCache:
         everybody = (self.valid[:, : self._last] & earlier[..., None]).flatten(1)[:, None, None, :]
         return NodeMasks(earlier.repeat_interleave(valid.shape[1], 0)[:, None, None, :], everybody)
 
+    @torch.compiler.disable  # it grows by a decision at a time
     def add(self, layer: int, nodes: KeyValues) -> KeyValues:
         """Write this decision's nodes and give all up to the last decision."""
         keys, values = self.keys[layer], self.values[layer]

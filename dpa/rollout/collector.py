@@ -181,6 +181,7 @@ def make_collector(
     memory: float = 1.0,
     device: torch.device | str = "cpu",
     precision: Precision = "float32",
+    compile: bool = False,
 ) -> RolloutCollector:
     """Roll all scenes out, each K times: a TorchRL collector, in this process, in several, or on a Ray cluster.
 
@@ -203,6 +204,7 @@ def make_collector(
         memory: budget of each worker for rollouts [GiB]; a crowded scene is rolled out in pieces.
         device: of environment and policy.
         precision: of the policy's linear layers: ``"bfloat16"`` is for GPUs.
+        compile: the decoder, which pays for many scenes; see :class:`~dpa.policy.MotionActor`.
 
     Examples:
         >>> from dpa.tokens import VerletTokenizer
@@ -224,6 +226,7 @@ def make_collector(
         make_postproc=make_postproc,
         device=device,
         precision=precision,
+        compile=compile,
     )
     tasks = plan_tasks(agents_of(scenes, indices), num_rollouts, rows_within(memory, model, options), done)
     return RolloutCollector(job, tasks, workers)

@@ -65,6 +65,7 @@ class RolloutJob:
             :class:`~dpa.ranking.transform.RankRollouts`; applied to the whole rollouts ``[S * K, T]`` of the task.
         device: of environment and policy.
         precision: of the policy's linear layers, see :class:`~dpa.policy.MotionActor`.
+        compile: the decoder, see :class:`~dpa.policy.MotionActor`.
     """
 
     scenes: SceneSource
@@ -76,6 +77,7 @@ class RolloutJob:
     make_postproc: Callable[[SceneSource], PostProcess] | None = None
     device: torch.device | str = "cpu"
     precision: Precision = "float32"
+    compile: bool = False
 
     def __post_init__(self) -> None:
         check_precision(self.precision)
@@ -139,6 +141,7 @@ class RolloutWorker:
             seed=job.seed,
             first_rollout=piece.start,
             precision=job.precision,
+            compile=job.compile,
         )
         frames = len(part) * len(piece) * options.horizon
         collector = Collector(

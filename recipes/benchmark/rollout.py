@@ -54,9 +54,10 @@ class Case:
     """What one measurement is of.
 
     Attributes:
-        how: ``incremental`` is the bare loop with a cache, ``naive`` the one that encodes all anew for each decision,
-            ``collector`` the collector that recipes use, ``ranked`` the same with the ranking behind it, ``trained`` a
-            step of pre-training on the scenes' logs.
+        how: ``incremental`` is the bare loop with a cache, ``compiled`` the same compiled; ``naive`` the one in which
+            each row encodes its scene and its past anew for each decision, ``uncached`` the same with the scene encoded
+            once for its rollouts; ``collector`` the collector that recipes use, ``ranked`` the same with the ranking
+            behind it, ``trained`` a step of pre-training on the scenes' logs.
         agents: of each scene, all controlled.
         rollouts: of each scene.
         scenes: side by side.
@@ -81,8 +82,13 @@ class Case:
         return self.agents * (1 if self.how == "trained" else self.rollouts) * self.scenes * 80
 
 
-class NaiveActor(MotionActor):
-    """Encodes the scene and all decisions so far anew for each decision; what decoding is without a cache."""
+class UncachedActor(MotionActor):
+    """Encodes the scene, once for its rollouts, and all decisions so far anew for each decision."""
+
+    @property
+    def sharing(self) -> int:
+        """Rows that share an encoded scene."""
+        return self.num_rollouts
 
     def logits(self, tensordict: TensorDictBase) -> Tensor:
         """``[B, A, V]`` of the decision at hand; all rows stand at the same one."""
@@ -93,7 +99,7 @@ class NaiveActor(MotionActor):
             self._taken = self._taken.to(scene.device)
         else:
             self._taken[..., step - 1] = self._last
-        rows = scene[:: self.num_rollouts].tolist()
+        rows = scene[:: self.sharing].tolist()
         context = pad_context(collate_contexts([self.contexts[i] for i in rows]), self._taken.shape[1]).to(scene.device)
         steps = self.model.tokenizer.steps * (step + 1)
         context = context.clone(recurse=False)
@@ -101,6 +107,12 @@ class NaiveActor(MotionActor):
         tokens = self._taken[..., : step + 1].unflatten(0, (len(rows), -1))
         valid = context.controlled[:, None, :, None].expand(-1, 1, -1, step + 1)
         return self.model(context, tokens, valid)[..., -1, :].flatten(0, 1)
+
+
+class NaiveActor(UncachedActor):
+    """The same for each row by itself: what decoding is where rollouts are a batch like any other."""
+
+    sharing = 1
 
 
 def add_options(part: argparse.ArgumentParser) -> None:
@@ -112,20 +124,21 @@ def add_options(part: argparse.ArgumentParser) -> None:
     part.add_argument("--threads", type=int, default=torch.get_num_threads(), help="of torch (default: %(default)s)")
     part.add_argument("--repeats", type=int, default=5, metavar="N", help="the median counts (default: %(default)s)")
     part.add_argument("--device", default="cpu", help="cpu or cuda (default: %(default)s)")
+    part.add_argument("--compile", action="store_true", help="also with the decoder compiled")
     part.add_argument("--sweep", action="store_true", help="also vary agents, rollouts and scenes, one at a time")
 
 
 def measure(options: dict[str, Any]) -> list[dict[str, Any]]:
     """Run the part and print its tables."""
-    main = Case("incremental", **{key: value for key, value in options.items() if key != "sweep"})
-    cases = [replace(main, how=how) for how in ("incremental", "collector", "naive", "ranked")]
+    main = Case("incremental", **{key: value for key, value in options.items() if key not in ("sweep", "compile")})
+    kinds = ("incremental", "collector", "naive", "uncached", "ranked", *(("compiled",) if options["compile"] else ()))
+    cases = [replace(main, how=how) for how in kinds]
     cases += [replace(main, how="trained", scenes=TRAINED_SCENES)]
-    if options["sweep"]:
-        cases += sweep(main)
-    rows = [asdict(case) | _apart(case) for case in progress(cases, "rollout", unit="case")]
-    _print(rows[:5], f"rollouts, {main.size} model, {main.device}, {main.threads} threads")
-    if options["sweep"]:
-        _print(rows[5:], "growth")
+    grown = sweep(main) if options["sweep"] else []
+    rows = [asdict(case) | _apart(case) for case in progress([*cases, *grown], "rollout", unit="case")]
+    _print(rows[: len(cases)], f"rollouts, {main.size} model, {main.device}, {main.threads} threads")
+    if grown:
+        _print(rows[len(cases) :], "growth")
     limit = _limit(main, rows[0])
     Console(width=110).print(_facts(rows, limit))
     return [*rows, limit]
@@ -162,8 +175,9 @@ def _bare(case: Case, model: MotionLM, scenes: list[Scene]) -> Callable[[], obje
     """Environment and policy called in turn, and nothing kept."""
     env = TrafficEnv(scenes, num_scenes=case.scenes, num_rollouts=case.rollouts, device=case.device)
     driven = TransformedEnv(env, TokenAction(model.tokenizer))
-    kind = NaiveActor if case.how == "naive" else MotionActor
-    actor = kind(model, Contexts(scenes), num_rollouts=case.rollouts, decoding=Decoding())
+    kind = {"naive": NaiveActor, "uncached": UncachedActor}.get(case.how, MotionActor)
+    options = {"num_rollouts": case.rollouts, "decoding": Decoding(), "compile": case.how == "compiled"}
+    actor = kind(model, Contexts(scenes), **options)
 
     def episode() -> None:
         state = driven.reset()
@@ -239,10 +253,11 @@ def _print(rows: list[dict[str, Any]], title: str) -> None:
 
 
 def _facts(rows: list[dict[str, Any]], limit: dict[str, float]) -> str:
-    bare, collector, naive = (row["agent_steps_per_second"] for row in rows[:3])
+    bare, collector, naive, uncached = (row["agent_steps_per_second"] for row in rows[:4])
     reached = f"{limit['agent_steps_per_second_at_most']:,.0f} agent-steps/s, {limit['fraction_reached']:.0%} reached"
     return (
-        f"incremental over naive: {bare / naive:.1f} times; collector over bare loop: {collector / bare:.2f}\n"
+        f"incremental over naive: {bare / naive:.1f} times, over uncached with a shared scene: {bare / uncached:.1f}; "
+        f"collector over bare loop: {collector / bare:.2f}\n"
         f"{limit['operations_per_agent_step'] / 1e6:.2f} MFLOP per agent-step at "
         f"{limit['matmul_per_second'] / 1e9:.0f} GFLOP/s (float32 {MATRIX} x {MATRIX}): at most {reached}"
     )

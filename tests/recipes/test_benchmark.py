@@ -17,7 +17,7 @@ from envs.sources.tfrecord import frame
 from envs.traffic import TrafficEnv
 from recipes.benchmark.__main__ import main
 from recipes.benchmark.realism import crowded_scene, noisy_log
-from recipes.benchmark.rollout import NaiveActor
+from recipes.benchmark.rollout import NaiveActor, UncachedActor
 from recipes.plan import main as plan_main
 
 
@@ -65,25 +65,26 @@ def test_rollouts_are_measured_and_planned_with(tmp_path: Path, capsys: pytest.C
     assert main(["rollout", *small, "--json", str(out)]) == 0
     assert "incremental over naive" in capsys.readouterr().out
     *rows, limit = json.loads(out.read_text())["rows"]
-    assert [row["how"] for row in rows] == ["incremental", "collector", "naive", "ranked", "trained"]
+    assert [row["how"] for row in rows] == ["incremental", "collector", "naive", "uncached", "ranked", "trained"]
     assert all(row["agent_steps_per_second"] > 0 for row in rows)
     assert 0 < limit["fraction_reached"] < 1
     assert plan_main([str(out), "--workers", "4", "--json", str(plan)]) == 0
     assert "grows with" in capsys.readouterr().out
     hours = {part["name"]: part["hours"] for part in json.loads(plan.read_text())["parts"]}
     assert hours["collect and rank"] == pytest.approx(
-        487_000 * 64 * 50 * 80 / rows[3]["agent_steps_per_second"] / 4 / 3600
+        487_000 * 64 * 50 * 80 / rows[4]["agent_steps_per_second"] / 4 / 3600
     )
 
 
-def test_the_naive_decoder_decodes_the_same() -> None:
+@pytest.mark.parametrize("kind", [NaiveActor, UncachedActor])
+def test_the_naive_decoder_decodes_the_same(kind: type[MotionActor]) -> None:
     """It is what the other one is measured against, so it must do the same work."""
     torch.manual_seed(0)
     model, scenes = MotionLM("nano", VerletTokenizer()).eval(), [crowded_scene(3, 100), crowded_scene(2, 100)]
     found = []
-    for kind in (MotionActor, NaiveActor):
+    for each in (MotionActor, kind):
         env = TransformedEnv(TrafficEnv(scenes, num_scenes=2, num_rollouts=2), TokenAction(model.tokenizer))
-        found.append(env.rollout(16, kind(model, Contexts(scenes), num_rollouts=2)))
+        found.append(env.rollout(16, each(model, Contexts(scenes), num_rollouts=2)))
     controlled = found[0][keys.CONTROLLED]
     assert torch.equal(*(rollout[keys.TOKEN][controlled] for rollout in found))
     log_probs = (rollout[keys.LOG_PROB][controlled] for rollout in found)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from typing import Any
 
@@ -230,6 +231,17 @@ def test_bfloat16_changes_the_distribution_by_little(model: MotionLM, scenes: li
     before, after = (actor.logits(state).float()[state[keys.CONTROLLED]].log_softmax(-1) for actor in (exact, rounded))
     assert not torch.equal(before, after)
     assert (before.exp() * (before - after)).sum(-1).abs().max() < 1e-3
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit:DeprecationWarning")  # raised by torch's own compiler
+@pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs a C++ compiler")
+@torch.no_grad()
+def test_a_compiled_decoder_gives_the_same_log_probs_and_tokens(model: MotionLM, scenes: list[Scene]) -> None:
+    ways = drive(model, scenes), drive(model, scenes, compile=True)
+    expected, found = (env.rollout(16, actor) for env, actor in ways)
+    seen = expected[keys.CONTROLLED]
+    assert torch.equal(found[keys.TOKEN][seen], expected[keys.TOKEN][seen])
+    torch.testing.assert_close(found[keys.LOG_PROB][seen], expected[keys.LOG_PROB][seen], atol=1e-5, rtol=1e-5)
 
 
 def test_an_unknown_precision_is_refused(model: MotionLM) -> None:
