@@ -14,20 +14,19 @@ from typing import Any
 import hydra
 import torch
 from omegaconf import DictConfig
-from tensordict import TensorDictBase
 
 from dpa.policy import Decoding
 from dpa.ranking import PreferenceDistance
 from dpa.realism import RealismResult, mean_result, realism
 from dpa.realism.submission import SubmissionWriter, plan_submission
-from dpa.rollout import lifted, make_collector, simulated_poses
-from envs import keys
+from dpa.rollout import make_collector
 from envs.progress import progress
-from envs.scene import CURRENT_STEP, SceneSource
+from envs.scene import CURRENT_STEP
 from envs.store import SceneStore
 from recipes.cli import CONFIG, build, finished, finite, plain, recipe, write_json
 from recipes.models import open_policy, weights_digest
 from recipes.partial import PartialResult
+from recipes.rolled import Rolled, rolled
 from recipes.scenes import fingerprint, open_splits
 
 STANDING, MOVED = 0.5, 2.0
@@ -91,7 +90,7 @@ def evaluate(
     ready = frozenset(scored) if submission is None else submission.done & scored.keys()
     bar = progress(total=len(scenes), description=f"evaluate top-p {top_p:g}", initial=len(ready), unit="scene")
     with bar, submission or nullcontext():
-        for batch in make_collector(
+        batches = make_collector(
             scenes,
             model,
             num_rollouts=options.num_rollouts,
@@ -101,10 +100,13 @@ def evaluate(
             seed=seed,
             memory=options.memory,
             device=cfg.device,
-        ):
-            fresh = score_group(batch, scenes, distance, options, bar.update, submission)
-            partial.add(fresh)
-            scored |= fresh
+        )
+        for each in rolled(batches, scenes, options.num_rollouts, ready):
+            scored[each.index] = score_scene(each, distance, options.metric)
+            partial.add({each.index: scored[each.index]})
+            if submission is not None:
+                submission.add(each.index, each.scene, each.trajectories, each.controlled)
+            bar.update()
         if submission is not None:
             submission.finish()
     content = {"options": decided_by, **summarise([scored[i] for i in range(len(scenes))], scenes.scene_ids)}
@@ -113,48 +115,23 @@ def evaluate(
     return content
 
 
-def score_group(
-    batch: TensorDictBase,
-    scenes: SceneSource,
-    distance: PreferenceDistance,
-    options: DictConfig,
-    tick: Callable[[], object],
-    submission: SubmissionWriter | None = None,
-) -> dict[int, dict[str, Any]]:
-    """Score the rollouts of a group of scenes.
+def score_scene(each: Rolled, distance: PreferenceDistance, metric: str) -> dict[str, Any]:
+    """The :class:`~dpa.realism.RealismResult` of one scene's rollouts as plain numbers, and figures of our own.
 
     Args:
-        batch: ``[S * K, T]``, from a collector.
-        scenes: that ``scene`` in the batch points to.
+        each: scene and rollouts.
         distance: how far rollouts are from the log.
-        options: the section ``evaluation``.
-        tick: called after each scene.
-        submission: where the rollouts go as well.
-
-    Returns:
-        For each scene by index, the :class:`~dpa.realism.RealismResult` as plain numbers and figures of our own.
+        metric: year of the realism metric, or a YAML.
     """
-    poses = simulated_poses(batch, options.num_rollouts).cpu()
-    controlled = batch[keys.CONTROLLED][:: options.num_rollouts, 0].cpu()
-    scored = {}
-    for row, index in enumerate(batch[keys.SCENE][:: options.num_rollouts, 0].tolist()):
-        scene = scenes[index]
-        trajectories = lifted(scene, poses[row])
-        moved = controlled[row, : trajectories.shape[1]]
-        ranking = distance(scene, trajectories, moved)
-        scored[index] = {
-            "result": asdict(realism(scene, trajectories, options.metric)),
-            "preference_distance": ranking.distance.mean().item(),
-            "standing_moved": standing_moved(scene, trajectories),
-        }
-        if submission is not None:
-            submission.add(index, scene, trajectories, moved)
-        tick()
-    return scored
+    return {
+        "result": asdict(realism(each.scene, each.trajectories, metric)),
+        "preference_distance": distance(each.scene, each.trajectories, each.controlled).distance.mean().item(),
+        "standing_moved": standing_moved(each.scene, each.trajectories),
+    }
 
 
 def summarise(scored: list[dict[str, Any]], scene_ids: list[str]) -> dict[str, Any]:
-    """Means over scenes and the figures of each, from what :func:`score_group` gives for each scene."""
+    """Means over scenes and the figures of each, from what :func:`score_scene` gives for each scene."""
     results = [RealismResult(**entry["result"]) for entry in scored]
     figures = [result.as_dict() | entry for result, entry in zip(results, scored, strict=True)]
     per_scene = {name: [finite(figure[name]) for figure in figures] for name in SCENE_FIGURES}

@@ -22,16 +22,16 @@ from torch import Tensor
 from dpa.policy import ContextOptions, Decoding, MotionLM
 from dpa.realism import realism
 from dpa.report.statistics import summary
-from dpa.rollout import lifted, make_collector, simulated_poses
+from dpa.rollout import lifted, make_collector
 from dpa.tokens import MotionTokenizer
 from dpa.training.seeding import seed_everything
-from envs import keys
 from envs.progress import progress
 from envs.scene import CURRENT_STEP, STEP_SECONDS, Scene, SceneSource
 from envs.seeding import make_generator
 from recipes.cli import CONFIG, build, finished, plain, recipe, write_json
 from recipes.models import build_policy, context_options, open_policy, policy_config, weights_digest
 from recipes.play import named
+from recipes.rolled import rolled
 from recipes.scenes import fingerprint, open_splits
 
 Rung = Callable[[Scene, int, torch.Generator], Tensor]
@@ -134,10 +134,8 @@ def driven(
         memory=cfg.evaluation.memory,
         device=cfg.device,
     )
-    for batch in batches:
-        poses = simulated_poses(batch, cfg.evaluation.num_rollouts).cpu()
-        for row, index in enumerate(batch[keys.SCENE][:: cfg.evaluation.num_rollouts, 0].tolist()):
-            yield index, lifted(scenes[index], poses[row])
+    for each in rolled(batches, scenes, cfg.evaluation.num_rollouts):
+        yield each.index, each.trajectories
 
 
 def rungs(cfg: DictConfig, scenes: SceneSource) -> Iterator[tuple[str, dict[str, Any], Iterator[tuple[int, Tensor]]]]:

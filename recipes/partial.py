@@ -1,4 +1,4 @@
-"""What an evaluation has scored so far, kept beside its result, so that a kill costs one group of scenes at most."""
+"""What an evaluation has scored so far, kept beside its result, so that a kill costs one scene at most."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 class PartialResult:
     """JSON lines ``[scene index, entry]`` after a first line with the options; removed once the result is written.
 
-    Lines are appended group by group in one write. What a kill cut short is left out, and so is all that was scored
+    Each is appended in one write. What a kill cut short is left out, and so is all that was scored
     with other options.
 
     Args:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -54,6 +54,12 @@ class Features:
     valid: Tensor
     vehicle: Tensor
     track_id: Tensor
+
+    def of(self, rollouts: Tensor) -> Features:
+        """The measurements of some of the rollouts, ``[R']`` int64; the log stays."""
+        kept = pad(rollouts + 1, (1, 0))
+        values = {name: value[kept] for name, value in self.values.items()}
+        return replace(self, values=values, displacement=self.displacement[rollouts], vehicle=self.vehicle[kept])
 
     @property
     def scored(self) -> Tensor:

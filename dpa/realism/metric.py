@@ -178,8 +178,7 @@ def realism_of(
         >>> [result.min_ade for result in realism_of(scenes, [torch.zeros(4, n, 80, 4) for n in (2, 3)])] != [0.0, 0.0]
         True
     """
-    config = config if isinstance(config, RealismConfig) else RealismConfig.load(config)
-    config = config if quirks else config.replace(quirks=frozenset())
+    config = _opened(config, quirks)
     extras = [None] * len(scenes) if generated is None else generated
     comparisons = []
     for scene, poses, extra in zip(scenes, simulated, extras, strict=True):
@@ -190,6 +189,47 @@ def realism_of(
         for batch in _batches(comparisons, memory * BYTES_PER_GIB)
         for measured in measure(batch, config)
     ]
+
+
+@torch.no_grad()
+def realism_of_groups(
+    scene: Scene,
+    simulated: Tensor,
+    groups: Sequence[Tensor],
+    config: str | Path | RealismConfig = "2024",
+    *,
+    quirks: bool = True,
+) -> list[RealismResult]:
+    """Score groups of the rollouts of one scene, each as :func:`realism` would; all are measured once.
+
+    Args:
+        scene: one uncollated scene.
+        simulated: ``[R, A, 80, 4]``, see :func:`realism`.
+        groups: of each group the rollouts, ``[R']`` int64.
+        config: see :func:`realism`.
+        quirks: see :func:`realism`.
+
+    Raises:
+        ValueError: as for :func:`realism`, or a group without rollouts.
+
+    Examples:
+        >>> from envs.sources.synthetic import straight_road
+        >>> scene = straight_road(num_vehicles=2)
+        >>> halves = torch.arange(8).view(2, 4)
+        >>> len(realism_of_groups(scene, torch.zeros(8, 2, 80, 4), halves))
+        2
+    """
+    if any(len(group) == 0 for group in groups):
+        raise ValueError(f"scene {scene.scene_id}: a group without rollouts has no realism; give each at least one.")
+    config = _opened(config, quirks)
+    _check(scene, simulated, config, None)
+    (measured,) = measure([compare(scene, simulated.to(scene.agents.position.dtype), config)], config)
+    return [_score(measured.of(group), config, features=False) for group in groups]
+
+
+def _opened(config: str | Path | RealismConfig, quirks: bool) -> RealismConfig:
+    config = config if isinstance(config, RealismConfig) else RealismConfig.load(config)
+    return config if quirks else config.replace(quirks=frozenset())
 
 
 def _batches(comparisons: list[Comparison], budget: float) -> Iterator[list[Comparison]]:

@@ -33,6 +33,7 @@ from recipes.evaluate import SCENE_FIGURES, standing_moved
 from recipes.models import open_policy
 from recipes.partial import PartialResult
 from recipes.pool import Job, Workers
+from recipes.rolled import Rolled
 
 METHODS = ("dpa_omf", "dpa_adef", "sft_best_oa", "sft_best_ade", "adversarial_afd")
 
@@ -287,7 +288,7 @@ def test_an_evaluation_has_every_figure_of_every_scene_and_their_means(scored: d
 def test_a_finished_evaluation_is_read_back(
     run: Callable, options: Callable, runs: Path, scored: dict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(evaluation, "score_group", None)
+    monkeypatch.setattr(evaluation, "score_scene", None)
     assert run("evaluate", *score_into(runs / "evaluation.json", runs, options)).status == 0
     assert not list(runs.glob(".evaluation*"))
 
@@ -296,16 +297,15 @@ def test_an_evaluation_goes_on_where_it_stopped(
     run: Callable, options: Callable, runs: Path, scored: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     command, seen = score_into(tmp_path / "evaluation.json", runs, options), []
-    whole = evaluation.score_group
+    whole = evaluation.score_scene
 
-    def counted(batch: object, *args: object) -> dict:
+    def counted(each: Rolled, *args: object) -> dict:
         if len(seen) == 1 and not list(tmp_path.glob("go")):
             raise Stopped
-        found = whole(batch, *args)
-        seen.append(sorted(found))
-        return found
+        seen.append(each.index)
+        return whole(each, *args)
 
-    monkeypatch.setattr(evaluation, "score_group", counted)
+    monkeypatch.setattr(evaluation, "score_scene", counted)
     assert run("evaluate", *command).status == 1
     partial = tmp_path / ".evaluation.json.scored"
     assert partial.is_file() and not (tmp_path / "evaluation.json").exists()
@@ -314,7 +314,7 @@ def test_an_evaluation_goes_on_where_it_stopped(
     (tmp_path / "go").touch()
     assert run("evaluate", *command).status == 0
     assert json.loads((tmp_path / "evaluation.json").read_text()) == scored
-    assert sorted(index for group in seen for index in group) == [0, 1, 2], "no scene is scored twice"
+    assert sorted(seen) == [0, 1, 2], "no scene is scored twice"
     assert not partial.exists()
 
 

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dpa.realism import RealismResult, mean_result, realism, realism_of
+from dpa.realism import RealismResult, mean_result, realism, realism_of, realism_of_groups
 from envs.scene import CURRENT_STEP, AgentKind, Agents, Scene, collate, select_agents
 from envs.sources.synthetic import straight_road, two_cars_head_on
 from tests.dpa.realism.golden import CODES, SHIPPED, Golden, golden_config
@@ -164,6 +164,17 @@ def test_scenes_of_any_size_score_together_as_they_do_alone(golden_scene, year: 
     scenes, simulated = [small, scene, small], [log, rollouts, log.expand(5, -1, -1, -1)]
     alone = [realism(one, poses, year) for one, poses in zip(scenes, simulated, strict=True)]
     assert realism_of(scenes, simulated, year, memory=memory) == alone
+
+
+@pytest.mark.parametrize("year", ["2023", "2024", "2025"])
+def test_groups_of_rollouts_score_as_they_do_alone(golden_scene, year: str) -> None:
+    scene, rollouts = golden_scene
+    groups = [torch.arange(len(rollouts)), torch.tensor([3]), torch.tensor([5, 0, 2])]
+    alone = [realism(scene, rollouts[group], year) for group in groups]
+    for found, wanted in zip(realism_of_groups(scene, rollouts, groups, year), alone, strict=True):
+        assert found.as_dict() == pytest.approx(wanted.as_dict(), rel=1e-6, abs=1e-7)
+    with pytest.raises(ValueError, match="a group without rollouts has no realism"):
+        realism_of_groups(scene, rollouts, [torch.arange(0)])
 
 
 def test_as_many_rollouts_as_scenes_are_needed(golden_scene) -> None:
