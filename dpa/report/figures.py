@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import csv
 import math
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from torch import Tensor
 
+from dpa.report.canvas import CYCLE, INK, NEGATIVE, NEUTRAL, POSITIVE, QUIET, blank_figure, calm, save_figure
 from dpa.report.table import REFERENCE, difference, summarise
 from envs.render import draw_agents, draw_map, draw_trails, fit_view, frame_view, pose_tracks
 from envs.scene import CURRENT_STEP, LOG_STEPS, Scene
 
-INK, QUIET, RULE = "#3c4043", "#8b9096", "#e3e5e8"
-POSITIVE, NEGATIVE, NEUTRAL = "#2a78b5", "#d55e00", "#8b9096"
-"""Better than the reference, worse, and not told apart from it."""
-CYCLE = ("#2a78b5", "#d55e00", "#009e73", "#b0509a", "#c79a1b", "#56b4e9", "#6b6b6b", "#000000")
 BUCKETS = (("kinematic", "kinematic"), ("interactive", "interactive"), ("map_based", "map"))
 
 Curve = Mapping[str, Sequence[float]]
@@ -45,7 +39,7 @@ def plot_comparison(comparison: Mapping[str, Any], path: str | Path) -> None:
     records = summarise(comparison["rows"], comparison["paired"])
     if not comparison["paired"]:
         raise ValueError("comparison['paired'] is empty: there is no difference to draw.")
-    figure = _figure(11, 1.1 + 0.42 * len(records))
+    figure = blank_figure(11, 1.1 + 0.42 * len(records))
     panels = figure.subplots(1, 4, sharey=True, width_ratios=[2.4, 1, 1, 1])
     names = [_label(record) for record in records]
     panels[0].set_yticks(range(len(names)), names)
@@ -54,9 +48,9 @@ def plot_comparison(comparison: Mapping[str, Any], path: str | Path) -> None:
     for axes, (key, title) in zip(panels[1:], BUCKETS, strict=True):
         _bucket(axes, records, comparison["rows"], key, title)
     for axes in panels:
-        _calm(axes, grid="x")
+        calm(axes, grid="x")
         axes.tick_params(axis="y", length=0)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _forest(axes: Axes, records: list[dict[str, Any]]) -> None:
@@ -138,14 +132,14 @@ def plot_curves(logs: Mapping[str, Mapping[str, Curve]], path: str | Path, *, sm
         raise ValueError("there is no curve to draw: no run has a scalar.")
     columns = min(3, len(scalars))
     rows = math.ceil(len(scalars) / columns)
-    figure = _figure(3.7 * columns, 2.4 * rows + 0.4)
+    figure = blank_figure(3.7 * columns, 2.4 * rows + 0.4)
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes, scalar in zip(panels, scalars, strict=False):
         for index, (run, curves) in enumerate(logs.items()):
             if scalar in curves:
                 _curve(axes, curves[scalar], f"{run}: {scalar}", run, CYCLE[index % len(CYCLE)], smooth)
         axes.set_title(scalar)
-        _calm(axes, grid="y")
+        calm(axes, grid="y")
     for axes in panels[len(scalars) :]:
         axes.set_axis_off()
     handles = {line.get_label(): line for axes in panels for line in axes.get_lines()}
@@ -154,7 +148,7 @@ def plot_curves(logs: Mapping[str, Mapping[str, Curve]], path: str | Path, *, sm
         figure.legend(
             handles.values(), handles.keys(), loc="outside lower center", ncols=min(6, len(handles)), frameon=False
         )
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _curve(axes: Axes, curve: Curve, name: str, run: str, color: str, smooth: int) -> None:
@@ -192,7 +186,7 @@ def plot_scenes(
     if not scenes:
         raise ValueError("there is no scene to draw.")
     columns = 1 + len(trajectories)
-    figure = _figure(3.2 * columns, 3.2 * len(scenes) + 0.3)
+    figure = blank_figure(3.2 * columns, 3.2 * len(scenes) + 0.3)
     panels = figure.subplots(len(scenes), columns, squeeze=False)
     for row, scene in enumerate(scenes):
         _scene_panel(panels[row, 0], scene, [pose_tracks(scene)], step)
@@ -202,7 +196,7 @@ def plot_scenes(
             _scene_panel(axes, scene, [pose_tracks(scene, rollout) for rollout in rollouts], step)
     for axes, title in zip(panels[0], ("log", *trajectories), strict=True):
         axes.set_title(title, fontsize=10, color=INK)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _scene_panel(axes: Axes, scene: Scene, tracks: Sequence[Tensor], step: int) -> None:
@@ -215,29 +209,3 @@ def _scene_panel(axes: Axes, scene: Scene, tracks: Sequence[Tensor], step: int) 
 
 def _label(record: Mapping[str, Any]) -> str:
     return record["method"] if record["top_p"] is None else f"{record['method']}  p {record['top_p']:g}"
-
-
-def _figure(width: float, height: float) -> Figure:
-    """A figure that belongs to no global state, so that threads and notebooks do not meet in it."""
-    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _calm(axes: Axes, grid: str) -> None:
-    axes.grid(axis=grid, color=RULE, lw=0.8)
-    axes.set_axisbelow(True)
-    axes.tick_params(colors=INK, labelsize=8, width=0.6, color=RULE)
-    axes.title.set(fontsize=9, color=INK)
-    for side, spine in axes.spines.items():
-        spine.set_visible(side == "bottom")
-        spine.set_color(RULE)
-
-
-def _save(figure: Figure, path: str | Path) -> None:
-    path = Path(path)
-    if path.suffix.lower() != ".png":
-        raise ValueError(f"a figure must end in .png, got {path}.")
-    part = path.with_name(path.name + ".part")
-    figure.savefig(part, format="png", dpi=160)
-    os.replace(part, path)

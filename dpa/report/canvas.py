@@ -1,0 +1,47 @@
+"""What all figures share: colours, a canvas of their own, quiet axes, and files that appear whole."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+INK, QUIET, RULE = "#3c4043", "#8b9096", "#e3e5e8"
+POSITIVE, NEGATIVE, NEUTRAL = "#2a78b5", "#d55e00", "#8b9096"
+"""Better than the reference, worse, and not told apart from it."""
+CYCLE = ("#2a78b5", "#d55e00", "#009e73", "#b0509a", "#c79a1b", "#56b4e9", "#6b6b6b", "#000000")
+
+
+def blank_figure(width: float, height: float) -> Figure:
+    """A figure that belongs to no global state, so that threads and notebooks do not meet in it."""
+    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def calm(axes: Axes, grid: str) -> None:
+    """Leave of an axes' frame only what is read: the bottom line and a pale grid along ``grid`` (x, y or both)."""
+    axes.grid(axis=grid, color=RULE, lw=0.8)
+    axes.set_axisbelow(True)
+    axes.tick_params(colors=INK, labelsize=8, width=0.6, color=RULE)
+    axes.title.set(fontsize=9, color=INK)
+    for side, spine in axes.spines.items():
+        spine.set_visible(side == "bottom")
+        spine.set_color(RULE)
+
+
+def save_figure(figure: Figure, path: str | Path) -> None:
+    """Write a PNG whole or not at all.
+
+    Raises:
+        ValueError: another kind of file.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".png":
+        raise ValueError(f"a figure must end in .png, got {path}.")
+    part = path.with_name(path.name + ".part")
+    figure.savefig(part, format="png", dpi=160)
+    os.replace(part, path)

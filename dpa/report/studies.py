@@ -1,0 +1,98 @@
+"""Figures of the studies of rankings: what a distance says about realism, and what its options change."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from dpa.report.canvas import CYCLE, INK, NEUTRAL, QUIET, blank_figure, calm, save_figure
+from dpa.report.statistics import Interval
+
+
+def plot_validity(found: Mapping[str, Mapping[str, Any]], path: str | Path) -> None:
+    """Draw realism against mean distance, window by window, for each ranking (METHOD figure 3).
+
+    Left the curves with their 95 % bands: distance over the scene's mean, realism minus that of rollouts drawn at
+    random. Right the rank correlation of both within a scene.
+
+    Args:
+        found: for each ranking ``distance`` and ``realism``, an :class:`~dpa.report.statistics.Interval` for each
+            window, and ``correlation`` and ``near_half``.
+        path: PNG to write.
+    """
+    figure = blank_figure(10, 4)
+    left, right = figure.subplots(1, 2, width_ratios=[1.7, 1])
+    left.axhline(0, color=QUIET, lw=1, zorder=1)
+    for color, (name, values) in zip(_colours(len(found)), found.items(), strict=True):
+        x = [window.mean for window in values["distance"]]
+        y = values["realism"]
+        left.fill_between(x, [v.low for v in y], [v.high for v in y], color=color, alpha=0.15, lw=0)
+        left.plot(x, [v.mean for v in y], "o-", color=color, ms=3.5, lw=1.4, label=name)
+    left.set_xlabel("mean distance of the window over the scene's mean", fontsize=8, color=INK)
+    left.set_title("realism of a window minus that of random rollouts")
+    left.legend(frameon=False, fontsize=8, labelcolor=INK)
+    rows = {"all windows": "correlation", "nearer half": "near_half"}
+    _dots(right, {title: {name: values[key] for name, values in found.items()} for title, key in rows.items()})
+    right.set_title("Spearman of distance and realism in a scene")
+    for axes, grid in ((left, "both"), (right, "x")):
+        calm(axes, grid)
+    save_figure(figure, path)
+
+
+def plot_sensitivity(
+    agreement: Mapping[str, Interval], margins: Sequence[tuple[str, Mapping[str, Interval]]], path: str | Path
+) -> None:
+    """Draw how far variants of a distance rank as it does, and how that depends on the margin of a pair.
+
+    Args:
+        agreement: Spearman with the distance itself, by variant.
+        margins: for each range of margins its title and, by variant, the share of pairs in the same order.
+        path: PNG to write.
+    """
+    figure = blank_figure(11, 1.2 + 0.28 * max(len(agreement), 8))
+    left, right = figure.subplots(1, 2, width_ratios=[1, 1.3])
+    for row, value in enumerate(agreement.values()):
+        left.plot([value.low, value.high], [row, row], color=CYCLE[0], lw=2.2, solid_capstyle="round")
+        left.plot(value.mean, row, "o", color=CYCLE[0], ms=6, mec="white", mew=1)
+        left.annotate(f"{value.mean:.3f}", (value.mean, row), (0, 6), textcoords="offset points", **_SMALL)
+    left.set_yticks(range(len(agreement)), list(agreement))
+    left.set_ylim(len(agreement) - 0.4, -0.8)
+    left.set_title("rank correlation with the distance (Spearman)")
+    places = np.arange(len(margins))
+    for color, name in zip(_colours(len(agreement)), agreement, strict=True):
+        right.plot(places, [values[name].mean for _, values in margins], "o-", color=color, ms=3.5, lw=1.2, label=name)
+    right.set_xticks(places, [title for title, _ in margins])
+    right.set_xlabel("gap of a pair's distances over the scene's mean", fontsize=8, color=INK)
+    right.set_title("share of pairs in the same order")
+    right.legend(frameon=False, fontsize=7, labelcolor=INK, ncols=2)
+    for axes, grid in ((left, "x"), (right, "y")):
+        calm(axes, grid)
+    left.tick_params(axis="y", length=0)
+    save_figure(figure, path)
+
+
+_SMALL = {"ha": "center", "fontsize": 7, "color": INK}
+
+
+def _dots(axes: Axes, rows: Mapping[str, Mapping[str, Interval]]) -> None:
+    """Means with intervals: a group of rows for each title, in it one for each name."""
+    names = list(next(iter(rows.values())))
+    step = 0.7 / max(len(names), 1)
+    for group, values in enumerate(rows.values()):
+        for color, (place, value) in zip(_colours(len(names)), enumerate(values.values()), strict=True):
+            y = group + step * (place - (len(names) - 1) / 2)
+            axes.plot([value.low, value.high], [y, y], color=color, lw=2, solid_capstyle="round")
+            axes.plot(value.mean, y, "o", color=color, ms=5.5, mec="white", mew=1)
+    axes.axvline(0, color=NEUTRAL, lw=1, zorder=1)
+    axes.set_yticks(range(len(rows)), list(rows))
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+    axes.tick_params(axis="y", length=0)
+
+
+def _colours(count: int) -> list[str]:
+    """As many colours as needed; beyond the palette they come round again."""
+    return [CYCLE[i % len(CYCLE)] for i in range(count)]

@@ -1,0 +1,94 @@
+"""What studies of rankings share: each policy rolls each scene out once, and every scene's numbers are kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from dpa.policy import Decoding
+from dpa.ranking import PreferenceDistance
+from dpa.rollout import make_collector
+from envs.progress import progress
+from envs.store import SceneStore
+from recipes.cli import build, finished, plain, write_json
+from recipes.models import open_policy, weights_digest
+from recipes.partial import PartialResult
+from recipes.play import named
+from recipes.rolled import Rolled, rolled
+from recipes.scenes import fingerprint
+
+Measure = Callable[[Rolled], dict[str, Any]]
+"""Numbers of one scene from its rollouts, ready for JSON."""
+
+
+def study(cfg: DictConfig, scenes: SceneStore, measure: Measure, decided_by: dict[str, Any]) -> dict[str, list[dict]]:
+    """Measure every scene under every policy; what an earlier run has measured is read back.
+
+    Args:
+        cfg: with ``policies``, ``num_rollouts``, ``decoding``, ``seed``, ``memory``, ``device`` and ``output``.
+        scenes: to roll out.
+        measure: of one scene.
+        decided_by: options of the measure.
+
+    Returns:
+        For each policy by name what ``measure`` gave for each scene.
+
+    Raises:
+        ValueError: no policy is given.
+    """
+    policies = named([cfg.policies] if isinstance(cfg.policies, str) else list(cfg.policies))
+    if not policies:
+        raise ValueError("policies=[] names no policy; say for example policies=[runs/pretrain/policy.pt].")
+    return {name: _measured(cfg, scenes, path, measure, decided_by, name) for name, path in policies.items()}
+
+
+def _measured(
+    cfg: DictConfig, scenes: SceneStore, policy: Path, measure: Measure, decided_by: dict[str, Any], name: str
+) -> list[dict]:
+    model, context, _ = open_policy(policy, cfg.device)
+    options = decided_by | {
+        "policy": weights_digest(model),
+        "scenes": fingerprint(scenes),
+        "num_rollouts": cfg.num_rollouts,
+        "decoding": plain(cfg.decoding),
+        "seed": cfg.seed,
+    }
+    path = Path(cfg.output) / f"{name.replace('/', '_')}.json"
+    done = finished(path, options)
+    if done is not None:
+        return done["per_scene"]
+    partial = PartialResult(path, options)
+    found = partial.read()
+    batches = make_collector(
+        scenes,
+        model,
+        num_rollouts=cfg.num_rollouts,
+        done=found,
+        decoding=build(Decoding, cfg.decoding, "decoding"),
+        options=context,
+        seed=cfg.seed,
+        memory=cfg.memory,
+        device=cfg.device,
+    )
+    with progress(total=len(scenes), description=name, initial=len(found), unit="scene") as bar:
+        for each in rolled(batches, scenes, cfg.num_rollouts, frozenset(found)):
+            numbers = measure(each)
+            partial.add({each.index: numbers})
+            found[each.index] = numbers
+            bar.update()
+    per_scene = [found[index] for index in range(len(scenes))]
+    write_json(path, {"options": options, "scenes": scenes.scene_ids, "per_scene": per_scene})
+    partial.remove()
+    return per_scene
+
+
+def distances_of(section: DictConfig, name: str) -> dict[str, PreferenceDistance]:
+    """Distances by name, from a section of the configuration that holds the options of each.
+
+    Raises:
+        ValueError: a wrong option; the message names it.
+    """
+    return {key: build(PreferenceDistance, options, f"{name}.{key}") for key, options in section.items()}

@@ -1,0 +1,209 @@
+"""Does a distance to the log tell realism (METHOD figure 3)?
+
+python -m recipes.validity policies=[runs/pretrain/policy.pt]
+
+Each scene is rolled out many times and its rollouts are sorted by a distance to the log. A window slides over them,
+from the nearest to the farthest: the realism of the rollouts in it against their mean distance. Run the same command
+again to go on after a kill.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import hydra
+import numpy as np
+import torch
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from dpa.ranking import PreferenceDistance
+from dpa.ranking.agreement import rank_correlation
+from dpa.ranking.distance import rank_of
+from dpa.realism import realism_of_groups
+from dpa.report.statistics import Interval, paired_bootstrap, summary
+from dpa.report.studies import plot_validity
+from envs.seeding import make_generator
+from recipes.cli import CONFIG, finite, plain, recipe, write_json
+from recipes.rolled import Rolled
+from recipes.scenes import open_splits
+from recipes.study import distances_of, study
+
+FIGURES = ("realism", "kinematic", "interactive", "map_based")
+RANDOM_GROUPS = 8
+"""Groups of rollouts drawn at random from a scene: what a window scores that no distance has chosen."""
+ADE = "ade"
+
+
+def windows(distance: Tensor, size: int, stride: int) -> list[Tensor]:
+    """Rollouts in each window over the order of a distance, nearest first; ties go to the smaller index.
+
+    Args:
+        distance: ``[K]``.
+        size: rollouts of a window.
+        stride: from one window to the next.
+
+    Examples:
+        >>> windows(torch.tensor([0.3, 0.1, 0.2, 0.4]), size=2, stride=2)
+        [tensor([1, 2]), tensor([0, 3])]
+    """
+    order = rank_of(distance).argsort()
+    return [order[first : first + size] for first in range(0, len(order) - size + 1, stride)]
+
+
+def measure_scene(
+    each: Rolled, distances: dict[str, PreferenceDistance], window: int, stride: int, metric: str, seed: int
+) -> dict[str, Any]:
+    """Mean distance and realism of every window of every ranking, and of random groups.
+
+    Args:
+        each: scene and rollouts.
+        distances: rankings by name; displacement from the log is one more, ``ade``.
+        window: rollouts of a window.
+        stride: from one window to the next.
+        metric: year of the realism metric, or a YAML.
+        seed: of the random groups.
+    """
+    rankings = {name: distance(each.scene, each.trajectories, each.controlled) for name, distance in distances.items()}
+    values = {name: ranking.distance for name, ranking in rankings.items()}
+    values[ADE] = next(iter(rankings.values())).ade
+    draw = make_generator(seed, "validity", each.index)
+    chosen = [torch.randperm(len(each.trajectories), generator=draw)[:window] for _ in range(RANDOM_GROUPS)]
+    groups = {name: windows(value, window, stride) for name, value in values.items()} | {"random": chosen}
+    flat = [group for each_group in groups.values() for group in each_group]
+    scores = iter(realism_of_groups(each.scene, each.trajectories, flat, metric))
+    found: dict[str, Any] = {}
+    for name, members in groups.items():
+        results = [next(scores) for _ in members]
+        found[name] = {figure: [finite(getattr(result, figure)) for result in results] for figure in FIGURES}
+        if name in values:
+            found[name]["distance"] = [values[name][group].mean().item() for group in members]
+    return found
+
+
+def summarise(measured: dict[str, list[dict]]) -> dict[str, dict[str, Any]]:
+    """What every ranking is worth, with intervals over policies and scenes.
+
+    Args:
+        measured: for each policy what :func:`measure_scene` gave for each scene.
+
+    Returns:
+        For each ranking ``correlation`` (Spearman of mean distance and realism over the windows of a scene; -1 is
+        best), ``nearest`` and ``farthest`` (realism of the first and the last window minus that of random groups),
+        ``near_half`` (the correlation over the nearer half of the windows alone), each an
+        :class:`~dpa.report.statistics.Interval`, and the curves ``distance`` (over the scene's mean) and ``realism``
+        (minus that of random groups) with one interval for each window. Scenes where a distance or the realism is the
+        same for all windows say nothing about a correlation and are left out of it; scenes without realism (nothing of
+        one of its features is scored) are left out of everything.
+
+    Raises:
+        ValueError: no scene has realism, or none tells its windows apart.
+    """
+    rows = _with_realism(measured)
+    names = [name for name in rows[0][0] if name != "random"]
+    random = np.array([[np.mean(scene["random"]["realism"]) for scene in row] for row in rows])
+    found = {}
+    for name in names:
+        distance, score = (
+            np.array([[scene[name][key] for scene in row] for row in rows]) for key in ("distance", "realism")
+        )
+        half = distance.shape[-1] // 2 + 1
+        gain = score - random[..., None]
+        relative = distance / np.maximum(distance.mean(-1, keepdims=True), np.finfo(float).tiny)
+        found[name] = {
+            "correlation": _over_scenes(rank_correlation(distance, score)),
+            "near_half": _over_scenes(rank_correlation(distance[..., :half], score[..., :half])),
+            "nearest": summary(gain[..., 0]),
+            "farthest": summary(gain[..., -1]),
+            "distance": [summary(relative[..., place]) for place in range(relative.shape[-1])],
+            "realism": [summary(gain[..., place]) for place in range(gain.shape[-1])],
+        }
+    return found
+
+
+def against_ade(measured: dict[str, list[dict]]) -> dict[str, Interval]:
+    """Realism of the nearest window of each ranking minus that of the ADE's, scene by scene."""
+    rows = _with_realism(measured)
+
+    def nearest(name: str) -> np.ndarray:
+        return np.array([[scene[name]["realism"][0] for scene in row] for row in rows])
+
+    names = [name for name in rows[0][0] if name not in ("random", ADE)]
+    return {name: paired_bootstrap(nearest(name), nearest(ADE)) for name in names}
+
+
+def _with_realism(measured: dict[str, list[dict]]) -> list[list[dict]]:
+    """For each policy the scenes that have realism under all of them."""
+    rows = list(measured.values())
+    kept = [i for i in range(len(rows[0])) if all(None not in row[i]["random"]["realism"] for row in rows)]
+    if not kept:
+        raise ValueError("no scene has realism: none scores all features of the metric; choose scenes with vehicles.")
+    return [[row[i] for i in kept] for row in rows]
+
+
+def _over_scenes(values: np.ndarray) -> Interval:
+    """Mean over the scenes at which every policy has a value."""
+    known = ~np.isnan(values).any(0)
+    if not known.any():
+        raise ValueError("no scene tells its windows apart: neither distance nor realism vary; collect other scenes.")
+    return summary(values[:, known])
+
+
+@hydra.main(**CONFIG, config_name="validity")
+@recipe
+def main(cfg: DictConfig) -> None:
+    """Entry point of ``python -m recipes.validity``."""
+    if not 1 <= cfg.window <= cfg.num_rollouts or cfg.stride < 1:
+        raise ValueError(
+            f"window must be 1 to num_rollouts and stride 1 or more, got window={cfg.window}, stride={cfg.stride} and "
+            f"num_rollouts={cfg.num_rollouts}."
+        )
+    distances = distances_of(cfg.rankings, "rankings")
+    if not distances:
+        raise ValueError("rankings is empty: there is nothing to compare with the ADE; name at least one distance.")
+    scenes = open_splits(cfg.scenes)[cfg.split]
+    options = {key: plain(cfg)[key] for key in ("window", "stride", "metric")}
+    decided_by = options | {"rankings": {name: distance.describe() for name, distance in distances.items()}}
+    measured = study(cfg, scenes, lambda each: measure_scene(each, distances, seed=cfg.seed, **options), decided_by)
+    found, paired = summarise(measured), against_ade(measured)
+    folder = Path(cfg.output)
+    plot_validity(found, folder / "validity.png")
+    write_json(folder / "summary.json", {"rankings": _as_json(found), "nearest_minus_ade": _as_json(paired)})
+    _print(found, paired, len(scenes), len(measured), cfg)
+    print(f"numbers of every scene, summary and figure: {folder}")
+
+
+def _as_json(content: Any) -> Any:
+    if isinstance(content, Interval):
+        return {"mean": content.mean, "ci95": [content.low, content.high], "scenes": content.num_scenes}
+    if isinstance(content, dict):
+        return {key: _as_json(value) for key, value in content.items()}
+    return [_as_json(value) for value in content]
+
+
+def _print(found: dict, paired: dict[str, Interval], num_scenes: int, num_policies: int, cfg: DictConfig) -> None:
+    columns = ("correlation", "near_half", "nearest", "farthest")
+    titles = ("Spearman of distance and realism", "nearer half", "nearest window", "farthest window")
+    table = Table(
+        "ranking", *titles, "nearest minus ADE's", title=f"{num_scenes} scenes, {num_policies} policies, {cfg.metric}"
+    )
+    for name, values in found.items():
+        last = shown(paired[name]) if name in paired else "–"
+        table.add_row(name, *(shown(values[column]) for column in columns), last)
+    Console(width=160).print(table)
+    print(
+        f"windows of {cfg.window} of {cfg.num_rollouts} rollouts; realism minus that of {RANDOM_GROUPS} random groups; "
+        "95 % intervals"
+    )
+
+
+def shown(value: Interval) -> str:
+    """Mean and interval in a cell of a table."""
+    return f"{value.mean:+.3f} [{value.low:+.3f}, {value.high:+.3f}]"
+
+
+if __name__ == "__main__":
+    main()
