@@ -6,10 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from omegaconf import DictConfig
 
 from dpa.policy import Decoding
 from dpa.ranking import PreferenceDistance
+from dpa.report.statistics import Interval, summary
 from dpa.rollout import make_collector
 from envs.progress import progress
 from envs.store import SceneStore
@@ -92,3 +94,31 @@ def distances_of(section: DictConfig, name: str) -> dict[str, PreferenceDistance
         ValueError: a wrong option; the message names it.
     """
     return {key: build(PreferenceDistance, options, f"{name}.{key}") for key, options in section.items()}
+
+
+def over_scenes(values: np.ndarray, name: str) -> Interval:
+    """Mean over the scenes at which every policy has a value.
+
+    Raises:
+        ValueError: there is none.
+    """
+    known = ~np.isnan(values).any(0)
+    if not known.any():
+        raise ValueError(
+            f"{name}: in no scene do both measures tell rollouts apart, so that nothing is ranked; choose other scenes."
+        )
+    return summary(values[:, known])
+
+
+def as_json(content: Any) -> Any:
+    """Intervals anywhere in dicts and lists as plain JSON."""
+    if isinstance(content, Interval):
+        return {"mean": content.mean, "ci95": [content.low, content.high], "scenes": content.num_scenes}
+    if isinstance(content, dict):
+        return {key: as_json(value) for key, value in content.items()}
+    return [as_json(value) for value in content]
+
+
+def shown(value: Interval) -> str:
+    """Mean and interval in a cell of a table."""
+    return f"{value.mean:+.3f} [{value.low:+.3f}, {value.high:+.3f}]"

@@ -30,7 +30,7 @@ from envs.seeding import make_generator
 from recipes.cli import CONFIG, finite, plain, recipe, write_json
 from recipes.rolled import Rolled
 from recipes.scenes import open_splits
-from recipes.study import distances_of, study
+from recipes.study import as_json, distances_of, over_scenes, shown, study
 
 FIGURES = ("realism", "kinematic", "interactive", "map_based")
 RANDOM_GROUPS = 8
@@ -114,8 +114,8 @@ def summarise(measured: dict[str, list[dict]]) -> dict[str, dict[str, Any]]:
         gain = score - random[..., None]
         relative = distance / np.maximum(distance.mean(-1, keepdims=True), np.finfo(float).tiny)
         found[name] = {
-            "correlation": _over_scenes(rank_correlation(distance, score)),
-            "near_half": _over_scenes(rank_correlation(distance[..., :half], score[..., :half])),
+            "correlation": over_scenes(rank_correlation(distance, score), name),
+            "near_half": over_scenes(rank_correlation(distance[..., :half], score[..., :half]), name),
             "nearest": summary(gain[..., 0]),
             "farthest": summary(gain[..., -1]),
             "distance": [summary(relative[..., place]) for place in range(relative.shape[-1])],
@@ -144,14 +144,6 @@ def _with_realism(measured: dict[str, list[dict]]) -> list[list[dict]]:
     return [[row[i] for i in kept] for row in rows]
 
 
-def _over_scenes(values: np.ndarray) -> Interval:
-    """Mean over the scenes at which every policy has a value."""
-    known = ~np.isnan(values).any(0)
-    if not known.any():
-        raise ValueError("no scene tells its windows apart: neither distance nor realism vary; collect other scenes.")
-    return summary(values[:, known])
-
-
 @hydra.main(**CONFIG, config_name="validity")
 @recipe
 def main(cfg: DictConfig) -> None:
@@ -171,17 +163,9 @@ def main(cfg: DictConfig) -> None:
     found, paired = summarise(measured), against_ade(measured)
     folder = Path(cfg.output)
     plot_validity(found, folder / "validity.png")
-    write_json(folder / "summary.json", {"rankings": _as_json(found), "nearest_minus_ade": _as_json(paired)})
+    write_json(folder / "summary.json", {"rankings": as_json(found), "nearest_minus_ade": as_json(paired)})
     _print(found, paired, len(scenes), len(measured), cfg)
     print(f"numbers of every scene, summary and figure: {folder}")
-
-
-def _as_json(content: Any) -> Any:
-    if isinstance(content, Interval):
-        return {"mean": content.mean, "ci95": [content.low, content.high], "scenes": content.num_scenes}
-    if isinstance(content, dict):
-        return {key: _as_json(value) for key, value in content.items()}
-    return [_as_json(value) for value in content]
 
 
 def _print(found: dict, paired: dict[str, Interval], num_scenes: int, num_policies: int, cfg: DictConfig) -> None:
@@ -198,11 +182,6 @@ def _print(found: dict, paired: dict[str, Interval], num_scenes: int, num_polici
         f"windows of {cfg.window} of {cfg.num_rollouts} rollouts; realism minus that of {RANDOM_GROUPS} random groups; "
         "95 % intervals"
     )
-
-
-def shown(value: Interval) -> str:
-    """Mean and interval in a cell of a table."""
-    return f"{value.mean:+.3f} [{value.low:+.3f}, {value.high:+.3f}]"
 
 
 if __name__ == "__main__":

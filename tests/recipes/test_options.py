@@ -14,7 +14,8 @@ from omegaconf import DictConfig, OmegaConf
 from dpa.ranking import PreferenceDistance
 from recipes.cli import build, finished, recipe, write_json
 
-RECIPES = ("pretrain", "collect", "align", "evaluate", "play", "ladder", "tokens", "compare")
+RECIPES = ("pretrain", "collect", "align", "evaluate", "play", "ladder", "tokens", "compare", "validity", "sensitivity")
+WITHOUT_POLICY = ("pretrain", "ladder", "tokens", "compare", "play", "validity", "sensitivity")
 pytestmark = pytest.mark.usefixtures("stores")
 
 
@@ -71,7 +72,7 @@ def test_an_option_that_is_missing_is_told_by_name(run: Callable, options: Calla
 def test_scenes_that_do_not_exist_are_told_by_path(
     run: Callable, options: Callable, recipe: str, tmp_path: Path
 ) -> None:
-    more = [] if recipe in ("pretrain", "ladder", "tokens", "compare", "play") else ["policy=none.pt"]
+    more = [] if recipe in WITHOUT_POLICY else ["policy=none.pt"]
     more += ["policies=none.pt"] if recipe == "play" else []
     command = options(recipe, *more, "scenes.train=nowhere", f"{output_of(recipe)}={tmp_path / 'out'}")
     assert_refused(run(recipe, *command), "nowhere")

@@ -19,13 +19,13 @@ from envs.sources.synthetic import straight_road, two_cars_head_on
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Figures that were saved."""
-    saved, save = [], figures._save
+    saved, save = [], figures.save_figure
 
     def keep(figure: Any, path: Any) -> None:
         saved.append(figure)
         save(figure, path)
 
-    monkeypatch.setattr(figures, "_save", keep)
+    monkeypatch.setattr(figures, "save_figure", keep)
     return saved
 
 

@@ -1,0 +1,212 @@
+"""What do the options of the preference distance change?
+
+python -m recipes.sensitivity policies=[runs/pretrain/policy.pt]
+
+The same rollouts are ranked by the distance and by variants of it: other weights, a feature less, other couplings,
+fewer steps. How far do the ranks agree, which pairs turn round, what does each cost, and how wide are pairs with more
+rollouts? Run the same command again to go on after a kill.
+"""
+
+from __future__ import annotations
+
+import time
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import hydra
+import numpy as np
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.table import Table
+
+from dpa.ranking import PreferenceDistance
+from dpa.ranking.agreement import rank_correlation, same_order
+from dpa.report.statistics import Interval, summary
+from dpa.report.studies import plot_sensitivity
+from recipes.cli import CONFIG, plain, recipe, write_json
+from recipes.rolled import Rolled
+from recipes.scenes import open_splits
+from recipes.study import as_json, distances_of, over_scenes, shown, study
+
+ADE = "ade"
+MARGINS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, np.inf)
+"""Bounds of the ranges of a pair's gap over the scene's mean distance."""
+SMALLEST_GROUP = 8
+"""Rollouts of the smallest group whose pairs are looked at."""
+
+
+def measure_scene(each: Rolled, distances: dict[str, PreferenceDistance]) -> dict[str, Any]:
+    """Distance of every rollout by every variant, and the processor's time for it [s]."""
+    found: dict[str, Any] = {"distance": {}, "seconds": {}}
+    for name, distance in distances.items():
+        start = time.process_time()
+        ranking = distance(each.scene, each.trajectories, each.controlled)
+        found["seconds"][name] = time.process_time() - start
+        found["distance"][name] = ranking.distance.tolist()
+        found["distance"].setdefault(ADE, ranking.ade.tolist())
+    return found
+
+
+class Variants:
+    """The measured distances ``[policies, scenes, K]`` of every variant.
+
+    Args:
+        measured: for each policy what :func:`measure_scene` gave for each scene.
+        baseline: name of the distance that variants are compared with.
+    """
+
+    def __init__(self, measured: dict[str, list[dict]], baseline: str) -> None:
+        rows = list(measured.values())
+        self.names = list(rows[0][0]["distance"])
+        self.values = {
+            name: np.array([[scene["distance"][name] for scene in row] for row in rows]) for name in self.names
+        }
+        self.seconds = {
+            name: float(np.mean([scene["seconds"][name] for row in rows for scene in row]))
+            for name in self.names
+            if name != ADE
+        }
+        self.baseline = baseline
+
+    @property
+    def base(self) -> np.ndarray:
+        """``[policies, scenes, K]`` of the distance itself."""
+        return self.values[self.baseline]
+
+    def others(self) -> list[str]:
+        """Names of the variants."""
+        return [name for name in self.names if name != self.baseline]
+
+    def correlation(self, name: str) -> Interval:
+        """Spearman with the distance itself, over the scenes where both tell rollouts apart.
+
+        Raises:
+            ValueError: there is no such scene.
+        """
+        return over_scenes(rank_correlation(self.base, self.values[name]), name)
+
+    def overlap(self, name: str) -> Interval:
+        """Share of the nearest quarter of rollouts that the variant has among its nearest quarter too."""
+        quarter = self.base.shape[-1] // 4
+        chosen = [value.argsort(-1, kind="stable")[..., :quarter] for value in (self.base, self.values[name])]
+        shared = [
+            [len(set(a) & set(b)) / quarter for a, b in zip(mine, theirs, strict=True)]
+            for mine, theirs in zip(*chosen, strict=True)
+        ]
+        return summary(shared)
+
+    def turned(self, name: str) -> Interval:
+        """Share of the pairs of the nearest quarter with the farthest one that the variant would turn round."""
+        quarter = self.base.shape[-1] // 4
+        order = self.base.argsort(-1, kind="stable")
+        near, far = order[..., :quarter], order[..., : -quarter - 1 : -1]
+        value = self.values[name]
+        gap = np.take_along_axis(value, far, -1) - np.take_along_axis(value, near, -1)
+        return summary((gap < 0).mean(-1))
+
+    def by_margin(self, name: str, low: float, high: float) -> Interval | None:
+        """Share of pairs in the same order, of those whose gap over the scene's mean lies in a range; None: no pair."""
+        policies, scenes, count = self.base.shape
+        i, j = np.triu_indices(count, 1)
+        share = np.full((policies, scenes), np.nan)
+        for place in np.ndindex(policies, scenes):
+            base = self.base[place]
+            gap = np.abs(base[i] - base[j]) / max(base.mean(), np.finfo(float).tiny)
+            within = (gap >= low) & (gap < high) & (gap > 0)
+            if within.any():
+                share[place] = same_order(base, self.values[name][place])[within].mean()
+        return None if np.isnan(share).any(0).all() else over_scenes(share, name)
+
+    def pairs_of(self, rollouts: int) -> dict[str, Interval]:
+        """What pairs of the nearest and farthest quarter of the first rollouts are like.
+
+        ``margin``: gap of their distances over the scene's mean; ``ade_agrees``: share that ADE would order alike.
+        """
+        base, quarter = self.base[..., :rollouts], rollouts // 4
+        order = base.argsort(-1, kind="stable")
+        near, far = order[..., :quarter], order[..., : -quarter - 1 : -1]
+
+        def gap(value: np.ndarray) -> np.ndarray:
+            return np.take_along_axis(value, far, -1) - np.take_along_axis(value, near, -1)
+
+        scale = np.maximum(self.base.mean(-1, keepdims=True), np.finfo(float).tiny)
+        return {
+            "margin": summary((gap(base) / scale).mean(-1)),
+            "ade_agrees": summary((1 + np.sign(gap(self.values[ADE][..., :rollouts]))).mean(-1) / 2),
+        }
+
+
+def summarise(variants: Variants) -> dict[str, Any]:
+    """All tables of the study: ``variants`` by name, ``margins`` by range and variant, ``rollouts`` by their number."""
+    rollouts, sizes = variants.base.shape[-1], []
+    size = SMALLEST_GROUP
+    while size <= rollouts:
+        sizes.append(size)
+        size *= 2
+    ranges = list(pairwise(MARGINS))
+    margins = {title(*each): {name: variants.by_margin(name, *each) for name in variants.others()} for each in ranges}
+    return {
+        "variants": {
+            name: {
+                "correlation": variants.correlation(name),
+                "overlap": variants.overlap(name),
+                "turned": variants.turned(name),
+            }
+            for name in variants.others()
+        },
+        "margins": {range_: values for range_, values in margins.items() if None not in values.values()},
+        "rollouts": {size: variants.pairs_of(size) for size in sizes},
+    }
+
+
+def title(low: float, high: float) -> str:
+    """A range of margins in words.
+
+    Examples:
+        >>> title(0.05, 0.1), title(0.4, np.inf)
+        ('5–10 %', 'over 40 %')
+    """
+    return f"over {low:.0%}".replace("%", " %") if high == np.inf else f"{100 * low:g}–{100 * high:g} %"
+
+
+@hydra.main(**CONFIG, config_name="sensitivity")
+@recipe
+def main(cfg: DictConfig) -> None:
+    """Entry point of ``python -m recipes.sensitivity``."""
+    if cfg.num_rollouts < SMALLEST_GROUP:
+        raise ValueError(f"num_rollouts must be {SMALLEST_GROUP} or more, got {cfg.num_rollouts}.")
+    distances = distances_of(cfg.rankings, "rankings")
+    if cfg.baseline not in distances:
+        raise ValueError(f"baseline must be one of the rankings {', '.join(distances)}, got {cfg.baseline!r}.")
+    scenes = open_splits(cfg.scenes)[cfg.split]
+    decided_by = {"rankings": {name: distance.describe() for name, distance in distances.items()}}
+    variants = Variants(study(cfg, scenes, lambda each: measure_scene(each, distances), decided_by), cfg.baseline)
+    found, folder = summarise(variants), Path(cfg.output)
+    agreement = {name: values["correlation"] for name, values in found["variants"].items()}
+    plot_sensitivity(agreement, list(found["margins"].items()), folder / "sensitivity.png")
+    write_json(folder / "summary.json", as_json(found) | {"seconds": variants.seconds, "options": plain(cfg.rankings)})
+    _print(found, variants, len(scenes))
+    print(f"numbers of every scene, summary and figure: {folder}")
+
+
+def _print(found: dict[str, Any], variants: Variants, num_scenes: int) -> None:
+    policies, _, rollouts = variants.base.shape
+    head = f"{num_scenes} scenes, {policies} policies, {rollouts} rollouts, against {variants.baseline!r}"
+    table = Table("ranking", "Spearman", "same nearest quarter", "pairs turned round", "s per scene", title=head)
+    table.add_row(variants.baseline, "1", "1", "0", f"{variants.seconds[variants.baseline]:.3f}")
+    for name, values in found["variants"].items():
+        seconds = variants.seconds.get(name)
+        cells = (shown(values[key]) for key in ("correlation", "overlap", "turned"))
+        table.add_row(name, *cells, "–" if seconds is None else f"{seconds:.3f}")
+    pairs = Table(
+        "rollouts", "margin of a pair over the scene's mean", "ADE orders alike", title="nearest and farthest quarter"
+    )
+    for size, values in found["rollouts"].items():
+        pairs.add_row(str(size), shown(values["margin"]), shown(values["ade_agrees"]))
+    for each in (table, pairs):
+        Console(width=140).print(each)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,183 @@
+"""The studies of rankings: their statistics by hand, and both recipes on tiny scenes."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+
+from dpa.realism import realism
+from recipes import validity
+from recipes.cli import CONFIG
+from recipes.models import build_policy, policy_config, write_policy
+from recipes.sensitivity import Variants
+from recipes.sensitivity import summarise as summarise_variants
+from recipes.validity import summarise, windows
+
+SMALL = ["num_rollouts=8", "memory=0.001"]
+
+
+@pytest.fixture(scope="module")
+def policies(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Two untrained policies, as an option."""
+    folder = tmp_path_factory.mktemp("policies")
+    with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):
+        config = policy_config(compose("pretrain", ["model=nano"]).model)
+    for seed in (0, 1):
+        torch.manual_seed(seed)
+        (folder / str(seed)).mkdir()
+        write_policy(folder / f"{seed}/policy.pt", build_policy(config), config, {})
+    return f"policies=[{folder}/0/policy.pt,{folder}/1/policy.pt]"
+
+
+# --- validity -------------------------------------------------------------------------------------------------------
+def test_windows_slide_from_the_nearest_to_the_farthest_rollouts() -> None:
+    found = windows(torch.tensor([5.0, 1, 4, 0, 3, 2]), size=3, stride=1)
+    assert [group.tolist() for group in found] == [[3, 1, 5], [1, 5, 4], [5, 4, 2], [4, 2, 0]]
+
+
+def scene_of(distance: list[float], score: list[float], random: float = 0.5) -> dict:
+    return {"omf": {"distance": distance, "realism": score}, "random": {"realism": [random]}}
+
+
+def test_a_distance_that_orders_realism_correlates_with_it_in_every_scene() -> None:
+    scenes = [scene_of([1.0, 2, 3], [0.7, 0.6, 0.5]), scene_of([10.0, 20, 30], [0.3, 0.2, 0.1], random=0.2)]
+    found = summarise({"0": scenes, "1": scenes})["omf"]
+    assert found["correlation"].mean == pytest.approx(-1) and found["correlation"].num_scenes == 2
+    assert found["nearest"].mean == pytest.approx(0.15) and found["farthest"].mean == pytest.approx(-0.05)
+    assert [window.mean for window in found["distance"]] == pytest.approx([0.5, 1, 1.5])
+    assert found["nearest"].num_seeds == 2
+
+
+def test_scenes_that_say_nothing_are_left_out() -> None:
+    scenes = [scene_of([1.0, 2, 3], [0.7, 0.6, 0.5]), scene_of([1.0, 1, 1], [0.7, 0.6, 0.5])]
+    without = {"omf": {"distance": [1, 2, 3], "realism": [None] * 3}, "random": {"realism": [None]}}
+    found = summarise({"0": [*scenes, without]})["omf"]
+    assert found["correlation"].num_scenes == 1 and found["nearest"].num_scenes == 2
+    with pytest.raises(ValueError, match="no scene has realism"):
+        summarise({"0": [without]})
+    with pytest.raises(ValueError, match="omf: in no scene do both measures tell rollouts apart"):
+        summarise({"0": scenes[1:]})
+
+
+def test_validity_scores_each_window_as_the_metric_does(
+    run: Callable, options: Callable, policies: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+
+    def spied(scene: object, simulated: torch.Tensor, groups: list[torch.Tensor], metric: str) -> list:
+        seen.append(groups)
+        return [realism(scene, simulated[group], metric) for group in groups]
+
+    monkeypatch.setattr(validity, "realism_of_groups", spied)
+    command = options("validity", policies, *SMALL, "window=4", "stride=2", f"output={tmp_path / 'a'}")
+    outcome = run("validity", *command)
+    assert outcome.status == 0, outcome.err
+    assert len(seen) == 4, "two policies, two tuning scenes"
+    monkeypatch.undo()
+    again = run("validity", *[option.replace(str(tmp_path / "a"), str(tmp_path / "b")) for option in command])
+    assert again.status == 0
+    for name in ("0.json", "1.json"):
+        first, second = (json.loads((tmp_path / run / name).read_text())["per_scene"] for run in ("a", "b"))
+        assert len(first) == 2 and list(first[0]) == [*cfg_rankings(), "ade", "random"]
+        assert first[0]["ade"]["distance"] == sorted(first[0]["ade"]["distance"])
+        assert np.array(first[0]["omf"]["realism"]) == pytest.approx(second[0]["omf"]["realism"], rel=1e-6)
+    assert (tmp_path / "a/validity.png").stat().st_size > 10_000
+    summary = json.loads((tmp_path / "a/summary.json").read_text())
+    assert summary["nearest_minus_ade"]["omf"]["scenes"] == 2
+
+
+def cfg_rankings() -> list[str]:
+    with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):
+        return list(compose("validity").rankings)
+
+
+def test_a_finished_study_is_read_back_and_a_killed_one_goes_on(
+    run: Callable, options: Callable, policies: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = options("validity", policies, *SMALL, "window=4", "stride=4", f"output={tmp_path}")
+    whole, seen = validity.measure_scene, []
+
+    def counted(each: object, *args: object, **kwargs: object) -> dict:
+        if len(seen) == 1:
+            raise KeyboardInterrupt
+        seen.append(each.index)
+        return whole(each, *args, **kwargs)
+
+    monkeypatch.setattr(validity, "measure_scene", counted)
+    assert run("validity", *command).status == 130
+    seen.append(None)
+    assert run("validity", *command).status == 0
+    assert sorted(index for index in seen if index is not None) == [0, 0, 1, 1], "no scene is measured twice"
+    monkeypatch.setattr(validity, "measure_scene", None)
+    assert run("validity", *command).status == 0
+    other = run("validity", *command, "stride=2")
+    assert other.status == 2 and "was written with other options ('stride'" in other.err
+
+
+@pytest.mark.parametrize(
+    ("recipe", "more", "message"),
+    [
+        ("validity", ["window=9"], "window must be 1 to num_rollouts"),
+        ("validity", ["policies=[]"], "policies=.. names no policy"),
+        ("validity", ["+rankings.bad={method: teleport}"], "unknown method 'teleport'"),
+        ("sensitivity", ["baseline=none"], "baseline must be one of the rankings paper"),
+        ("sensitivity", ["num_rollouts=4"], "num_rollouts must be 8 or more, got 4"),
+    ],
+)
+def test_a_wrong_option_is_told_before_any_work(
+    run: Callable, options: Callable, policies: str, tmp_path: Path, recipe: str, more: list[str], message: str
+) -> None:
+    window = ["window=4"] if recipe == "validity" and "window=9" not in more else []
+    outcome = run(recipe, *options(recipe, policies, *SMALL, *window, f"output={tmp_path / 'out'}", *more))
+    assert outcome.status == 2
+    assert re.search(message, outcome.err), outcome.err
+    assert not (tmp_path / "out").exists()
+
+
+# --- sensitivity ----------------------------------------------------------------------------------------------------
+def variants(**distances: list[float]) -> Variants:
+    seconds = dict.fromkeys(distances, 0.1)
+    return Variants({"0": [{"distance": {**distances, "ade": distances["paper"]}, "seconds": seconds}]}, "paper")
+
+
+def test_a_ranking_turned_round_turns_every_pair_round() -> None:
+    found = variants(paper=[1.0, 2, 3, 4, 5, 6, 7, 8], mirrored=[8.0, 7, 6, 5, 4, 3, 2, 1])
+    assert found.correlation("mirrored").mean == pytest.approx(-1) and found.correlation("ade").mean == pytest.approx(1)
+    assert found.turned("mirrored").mean == 1 and found.turned("ade").mean == 0
+    assert found.overlap("mirrored").mean == 0 and found.overlap("ade").mean == 1
+
+
+def test_pairs_are_sorted_by_their_margin() -> None:
+    # Gaps over the mean of 10: 0.01 for the first two, which the variant turns round; more for all others.
+    found = variants(paper=[9.0, 9.1, 11.0, 10.9], other=[9.1, 9.0, 11.0, 10.9])
+    assert found.by_margin("other", 0.0, 0.02).mean == pytest.approx(0.5)
+    assert found.by_margin("other", 0.1, 0.4).mean == 1
+    assert found.by_margin("other", 0.4, np.inf) is None
+
+
+def test_more_rollouts_make_wider_pairs() -> None:
+    values = np.random.default_rng(0).random(64).tolist()
+    rows = summarise_variants(variants(paper=values, other=values))["rollouts"]
+    assert list(rows) == [8, 16, 32, 64]
+    order = np.sort(values[:8])
+    assert rows[8]["margin"].mean == pytest.approx((order[-2:].mean() - order[:2].mean()) / np.mean(values))
+
+
+def test_sensitivity_ranks_the_same_rollouts_by_every_variant(
+    run: Callable, options: Callable, policies: str, tmp_path: Path
+) -> None:
+    outcome = run("sensitivity", *options("sensitivity", policies, *SMALL, f"output={tmp_path}"))
+    assert outcome.status == 0, outcome.err
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert {"2 Hz", "time-aligned", "ade", "progress only"} <= set(summary["variants"])
+    assert summary["variants"]["2 Hz"]["correlation"]["mean"] > 0.5
+    (first, *_) = json.loads((tmp_path / "0.json").read_text())["per_scene"]
+    assert {len(values) for values in first["distance"].values()} == {8}
+    assert (tmp_path / "sensitivity.png").stat().st_size > 10_000
