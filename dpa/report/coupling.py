@@ -27,6 +27,8 @@ ROLLOUT_COLOR, LOG_COLOR, OTHERS_COLOR = "#d55e00", "#2a2d30", "#9aa0a6"
 TIMES = LinearSegmentedColormap.from_list("times", ["#0b2a6f", "#2a78b5", "#56b4e9", "#d9f0d3"])
 """From the first step to the last: dark to light, so that it also reads in grey."""
 COSTS = LinearSegmentedColormap.from_list("costs", ["#ffffff", "#c9ced3", "#71777e"]).with_extremes(bad="#f4ead8")
+RIM = 4.6
+"""Width of a track with its rim [points]."""
 MARGIN, SMALLEST_RADIUS = 8.0, 16.0
 """Room around both tracks, and least half side of the window [m]."""
 FEATURES_IN_A_ROW = 5
@@ -182,36 +184,35 @@ def agent_name(scene: Scene, agent: int) -> str:
 def _draw_tracks(axes: Axes, scene: Scene, trajectory: Tensor, agent: int) -> None:
     """The agent's rollout and log, coloured by time, over the map and the other agents' rollouts."""
     row = int(scene.agents.present.nonzero()[agent, 0])
-    extent, last = scene.agents.extent[row], CURRENT_STEP + trajectory.shape[1]
-    log, simulated = pose_tracks(scene), pose_tracks(scene, trajectory)
-    sides = [(side[row, CURRENT_STEP : last + 1], c) for side, c in ((log, LOG_COLOR), (simulated, ROLLOUT_COLOR))]
-    window_around(axes, torch.cat([poses[:, :2] for poses, _ in sides]))
+    last = CURRENT_STEP + trajectory.shape[1]
+    log, rollout = (poses[:, CURRENT_STEP : last + 1] for poses in (pose_tracks(scene), pose_tracks(scene, trajectory)))
+    window_around(axes, torch.cat((log[row, :, :2], rollout[row, :, :2])))
     draw_map(axes, scene)
-    others = torch.arange(len(simulated)) != row
-    _draw_others(axes, simulated[others, CURRENT_STEP : last + 1], scene.agents.extent[others])
-    for order, (poses, color) in enumerate(sides):
-        seen = torch.isfinite(poses).all(-1)
-        points = poses[:, :2].numpy()
-        pieces = np.stack((points[:-1], points[1:]), 1)
-        drawn = (seen[1:] & seen[:-1]).numpy()
-        for width, colors in ((4.6, color), (2.6, TIMES(np.linspace(0, 1, len(pieces)))[drawn])):
-            axes.add_collection(
-                LineCollection(pieces[drawn], colors=colors, linewidths=width, zorder=12 + order, capstyle="round")
-            )
-        end = poses[seen][-1]
-        axes.add_collection(
-            PolyCollection(
-                box_corners(end[None], extent[None]).numpy(), facecolors="none", edgecolors=color, linewidths=1.5,
-                zorder=14 + order,
-            )
-        )  # fmt: skip
-    sides = {"log": LOG_COLOR, "rollout": ROLLOUT_COLOR, "others in the rollout": OTHERS_COLOR}
+    others = torch.arange(len(rollout)) != row
+    _draw_others(axes, rollout[others], scene.agents.extent[others])
+    _draw_track(axes, log[row], scene.agents.extent[row], LOG_COLOR, zorder=12)
+    _draw_track(axes, rollout[row], scene.agents.extent[row], ROLLOUT_COLOR, zorder=13)
+    colors = {"log": LOG_COLOR, "rollout": ROLLOUT_COLOR, "others in the rollout": OTHERS_COLOR}
     legend = axes.legend(
-        [Line2D([], [], color=color, lw=4) for color in sides.values()], sides.keys(), loc="best", fontsize=8,
+        [Line2D([], [], color=color, lw=4) for color in colors.values()], colors.keys(), loc="best", fontsize=8,
         labelcolor=INK, edgecolor="none", framealpha=0.9,
     )  # fmt: skip
     legend.set_zorder(20)
     axes.set_title("tracks, dark to light in time", fontsize=9, color=INK)
+
+
+def _draw_track(axes: Axes, poses: Tensor, extent: Tensor, color: str, zorder: float) -> None:
+    """A track ``[T + 1, 3]`` coloured by time with a rim of one colour, and the agent's box where it ends."""
+    seen = torch.isfinite(poses).all(-1)
+    points = poses[:, :2].numpy()
+    pieces, drawn = np.stack((points[:-1], points[1:]), 1), (seen[1:] & seen[:-1]).numpy()
+    times = TIMES(np.linspace(0, 1, len(pieces)))[drawn]
+    for width, colors in ((RIM, color), (0.55 * RIM, times)):
+        axes.add_collection(
+            LineCollection(pieces[drawn], colors=colors, linewidths=width, zorder=zorder, capstyle="round")
+        )
+    box = box_corners(poses[seen][-1:], extent).numpy()
+    axes.add_collection(PolyCollection(box, facecolors="none", edgecolors=color, linewidths=1.5, zorder=zorder + 2))
 
 
 def _draw_others(axes: Axes, poses: Tensor, extent: Tensor) -> None:
@@ -230,11 +231,10 @@ def window_around(axes: Axes, points: Tensor) -> None:
     view = View(*((low + high) / 2).tolist(), radius)
     frame_view(axes, view)
     length = 5.0 if radius < 25 else 10.0 if radius < 50 else 20.0
-    x, y = view.x - 0.93 * radius, view.y - 0.92 * radius
-    axes.plot([x, x + length], [y, y], color=INK, lw=1.8, solid_capstyle="butt", zorder=19)
-    axes.text(
-        x + length / 2, y + 0.03 * radius, f"{length:g} m", ha="center", va="bottom", fontsize=8, color=INK, zorder=19
-    )
+    left = view.x - radius
+    below = {"transform": axes.get_xaxis_transform(), "clip_on": False, "color": INK}  # a track may end in any corner
+    axes.plot([left, left + length], [-0.03, -0.03], lw=1.8, solid_capstyle="butt", **below)
+    axes.text(left + length + 0.03 * radius, -0.03, f"{length:g} m", va="center", fontsize=8, **below)
 
 
 def _draw_coupling(figure: Figure | SubFigure, axes: Axes, coupled: AgentCoupling) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,6 +23,8 @@ MARKS = {"collision": ("X", "#000000"), "off road": ("v", "#f0b400")}
 """Marker and colour; shape repeats what colour says."""
 PANEL = 2.55
 """Side of the picture of a rollout [inches]."""
+LEGEND_ENTRY = 1.45
+"""Width of an entry of the legend [inches]."""
 LOG_PATH = {"color": LOG_COLOR, "lw": 0.8, "ls": (0, (2, 1.5))}
 
 
@@ -96,11 +99,16 @@ def plot_ranked(
         for first, (marker, color) in zip(found, MARKS.values(), strict=True):
             _mark(axes, trajectories[k, agents], first[position], marker, color)
     handles = [*legend_handles(scene), Line2D([], [], **LOG_PATH, label="path in the log"), *_marks(found)]
-    columns = min(len(handles), int(width / 1.45))
+    rows = math.ceil(len(handles) * LEGEND_ENTRY / width)
     figure.legend(
-        handles=handles, loc="outside lower center", ncols=columns, frameon=False, fontsize=8.5, labelcolor=INK
+        handles=handles,
+        loc="outside lower center",
+        ncols=math.ceil(len(handles) / rows),
+        frameon=False,
+        fontsize=8.5,
+        labelcolor=INK,
     )
-    text = f"scene {scene.scene_id}: the {each} nearest rollouts of {len(distance)} (above) and the {each} farthest"
+    text = f"scene {scene.scene_id}: of {len(distance)} rollouts, the nearest to the log above and the farthest below"
     figure.suptitle(text, fontsize=10.5, color=INK)
     _save(figure, path)
 

@@ -177,12 +177,12 @@ def test_both_tracks_lie_in_the_window(scene: Scene, braking: Tensor, tmp_path: 
     coupled = couple_agent(COARSE, scene, braking, 2)
     plot_coupling(scene, braking, 2, coupled, tmp_path / "a.png", title="one agent")
     axes = drawn[0].axes[0]
-    casings = [c for c in axes.collections if len(c.get_linewidth()) and c.get_linewidth()[0] == 4.6]
-    colors = [tuple(c.get_color()[0]) for c in casings]
+    rims = [c for c in axes.collections if len(c.get_linewidth()) and c.get_linewidth()[0] == coupling.RIM]
+    colors = [tuple(c.get_color()[0]) for c in rims]
     assert colors == [to_rgba(coupling.LOG_COLOR), to_rgba(coupling.ROLLOUT_COLOR)]
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
-    for casing in casings:
-        points = np.concatenate(casing.get_segments())
+    for rim in rims:
+        points = np.concatenate(rim.get_segments())
         assert ((points > (left, low)) & (points < (right, high))).all()
 
 
