@@ -32,6 +32,8 @@ RIM = 4.6
 MARGIN, SMALLEST_RADIUS = 8.0, 16.0
 """Room around both tracks, and least half side of the window [m]."""
 FEATURES_IN_A_ROW = 5
+LEAST_RANGE = 0.04
+"""Least range of values that a panel shows, as a part of the feature's clip range."""
 
 
 class AgentCoupling(NamedTuple):
@@ -137,8 +139,9 @@ def plot_coupling(
     """Draw one agent: both tracks, the coupling, what each feature adds, and the features over time (METHOD figure 2).
 
     The colour of a track and of the edges of the matrix is time. In the matrix, grey is the cost of a pair of steps and
-    dots are the coupling; a rollout like its log keeps to the diagonal. In the panels of features, the rollout stands
-    against the logged values that it is coupled with; the lines between the two are what it pays for.
+    dots are the coupling; a rollout like its log keeps to the diagonal, and steps that the log lacks are sand-coloured.
+    In the panels of features, the rollout stands against the logged values that it is coupled with; the lines between
+    the two are what it pays for.
 
     Args:
         scene: an uncollated scene.
@@ -296,9 +299,7 @@ def _draw_features(figure: SubFigure, coupled: AgentCoupling, rows: int) -> None
         axes.plot(seconds, rollout, color=ROLLOUT_COLOR, lw=1.4, label="rollout")
         unit = FEATURES[name].unit.replace("^2", "²")
         axes.set_title(label_of(name) if unit == "1" else f"{label_of(name)} [{unit}]")
-        axes.margins(y=0.12)
-        if unit == "1":  # a flag is always 0 in most panels, and matplotlib would zoom into nothing
-            axes.set_ylim(-0.08, 1.08)
+        _keep_range(axes, FEATURES[name].clip, whole=unit == "1")
         _calm(axes, grid="y")
     for axes in panels[len(coupled.names) :]:
         axes.set_axis_off()
@@ -315,6 +316,14 @@ def coupled_values(coupled: AgentCoupling) -> NDArray[np.float64]:
     mass = coupled.coupling.double()
     values = mass @ coupled.log.double() / mass.sum(-1, keepdim=True)
     return torch.where(coupled.valid[:, None], values, torch.nan).numpy()
+
+
+def _keep_range(axes: Axes, clip: tuple[float, float], *, whole: bool) -> None:
+    """Show a flag's whole range, and of others at least a part: differences that cost nothing should look like none."""
+    axes.margins(y=0.12)
+    low, high = clip if whole else axes.get_ylim()
+    room = 0.08 * (high - low) if whole else max(0.0, LEAST_RANGE * (clip[1] - clip[0]) - (high - low)) / 2
+    axes.set_ylim(low - room, high + room)
 
 
 def label_of(name: str) -> str:

@@ -14,7 +14,7 @@ from matplotlib.colors import to_rgba
 from PIL import Image
 from torch import Tensor
 
-from dpa.ranking import PreferenceDistance, log_trajectory, transport_cost
+from dpa.ranking import FEATURE_SETS, FEATURES, PreferenceDistance, log_trajectory, transport_cost
 from dpa.report import coupling
 from dpa.report.coupling import AgentCoupling, agent_name, couple_agent, coupled_values, feature_parts, plot_coupling
 from envs.scene import Scene
@@ -171,6 +171,14 @@ def test_each_feature_has_a_panel_with_its_unit(
     np.testing.assert_allclose(log, coupled.log[:, -1])
     np.testing.assert_allclose(rollout, coupled.rollout[:, -1])
     np.testing.assert_allclose(sorted(partner), sorted(log), rtol=1e-6, err_msg="a coupling permutes the log")
+
+
+def test_differences_that_cost_nothing_are_not_blown_up(scene: Scene, tmp_path: Path, drawn: list[Any]) -> None:
+    log = log_trajectory(scene, 80)
+    plot_coupling(scene, log, 0, couple_agent(COARSE, scene, log, 0), tmp_path / "a.png", title="the log")
+    ranges = [np.ptp(axes.get_ylim()) for axes in drawn[0].axes if axes.get_xlabel() == "time [s]"]
+    least = [0.999 * coupling.LEAST_RANGE * np.ptp(FEATURES[name].clip) for name in FEATURE_SETS["full"]]
+    assert (np.array(ranges) >= least).all() and ranges[0] > 1
 
 
 def test_both_tracks_lie_in_the_window(scene: Scene, braking: Tensor, tmp_path: Path, drawn: list[Any]) -> None:
