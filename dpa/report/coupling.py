@@ -19,7 +19,7 @@ from torch import Tensor
 
 from dpa.ranking import FEATURES, PreferenceDistance, log_trajectory, occupancy_features, transport_cost
 from dpa.ranking.features import feature_names, feature_weights
-from dpa.report.figures import INK, QUIET, RULE, _calm, _figure, _save
+from dpa.report.canvas import INK, QUIET, RULE, blank_figure, calm, save_figure
 from envs.render import View, box_corners, draw_map, frame_view, pose_tracks
 from envs.scene import CURRENT_STEP, STEP_SECONDS, AgentKind, Scene
 
@@ -155,7 +155,7 @@ def plot_coupling(
         ValueError: the path is no PNG.
     """
     rows = math.ceil(len(coupled.names) / FEATURES_IN_A_ROW)
-    figure = _figure(11.6, 4.7 + 2.1 * rows)
+    figure = blank_figure(11.6, 4.7 + 2.1 * rows)
     figure.get_layout_engine().set(w_pad=0.06, h_pad=0.05)
     top, bottom = figure.subfigures(2, 1, height_ratios=[4.7, 2.1 * rows])
     left, middle, right = top.subplots(1, 3, width_ratios=[1.0, 1.17, 0.5])
@@ -164,7 +164,7 @@ def plot_coupling(
     _draw_parts(right, coupled)
     _draw_features(bottom, coupled, rows)
     figure.suptitle(title, fontsize=10.5, color=INK)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def agent_name(scene: Scene, agent: int) -> str:
@@ -262,7 +262,7 @@ def _draw_coupling(figure: Figure | SubFigure, axes: Axes, coupled: AgentCouplin
     axes.set_xlabel("time in the log [s]", fontsize=8.5, color=INK)
     axes.set_ylabel("time in the rollout [s]", fontsize=8.5, color=INK)
     axes.set_title(f"coupling: distance {coupled.distance:.2f}, time-aligned {coupled.time_aligned:.2f}")
-    _calm(axes, grid="x")
+    calm(axes, grid="x")
     axes.grid(visible=False)
     bar = figure.colorbar(image, ax=axes, shrink=0.82, aspect=28, pad=0.02)
     bar.set_label("cost of a pair of steps", fontsize=8, color=INK)
@@ -280,7 +280,7 @@ def _draw_parts(axes: Axes, coupled: AgentCoupling) -> None:
     axes.set_xlim(0, 1.75 * max(*parts, 0.01))
     axes.xaxis.set_major_locator(MaxNLocator(3))
     axes.set_title("parts of the distance")
-    _calm(axes, grid="x")
+    calm(axes, grid="x")
     axes.tick_params(axis="y", length=0)
 
 
@@ -300,7 +300,7 @@ def _draw_features(figure: SubFigure, coupled: AgentCoupling, rows: int) -> None
         unit = FEATURES[name].unit.replace("^2", "²")
         axes.set_title(label_of(name) if unit == "1" else f"{label_of(name)} [{unit}]")
         _keep_range(axes, FEATURES[name].clip, whole=unit == "1")
-        _calm(axes, grid="y")
+        calm(axes, grid="y")
     for axes in panels[len(coupled.names) :]:
         axes.set_axis_off()
     for axes in panels[-columns:]:

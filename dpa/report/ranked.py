@@ -13,8 +13,8 @@ from matplotlib.lines import Line2D
 from torch import Tensor
 
 from dpa.ranking import log_trajectory, occupancy_features, rank_of
+from dpa.report.canvas import INK, blank_figure, save_figure
 from dpa.report.coupling import LOG_COLOR
-from dpa.report.figures import INK, _figure, _save
 from envs.render import draw_agents, draw_map, draw_trails, fit_view, frame_view, pose_tracks
 from envs.render.picture import legend_handles
 from envs.scene import CURRENT_STEP, Scene
@@ -86,7 +86,7 @@ def plot_ranked(
     chosen = torch.cat((order[:each], order[-each:]))
     found = incidents(scene, trajectories[chosen], agents)
     width = PANEL * (each + 2) + 0.4
-    figure = _figure(width, PANEL * 2 + 1.35)
+    figure = blank_figure(width, PANEL * 2 + 1.35)
     grid = figure.add_gridspec(2, each + 2)
     log = figure.add_subplot(grid[:, :2])
     _panel(log, scene, pose_tracks(scene), "log")
@@ -110,7 +110,7 @@ def plot_ranked(
     )
     text = f"scene {scene.scene_id}: of {len(distance)} rollouts, the nearest to the log above and the farthest below"
     figure.suptitle(text, fontsize=10.5, color=INK)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _panel(axes: Axes, scene: Scene, tracks: Tensor, title: str) -> None:

@@ -52,6 +52,7 @@ SECTIONS = {
     "play": ("threads", "scenes"),
     "ladder": ("threads", "scenes", "model", "evaluation"),
     "tokens": ("threads", "scenes", "model"),
+    "look": ("threads", "scenes"),
     "validity": ("threads", "scenes"),
     "sensitivity": ("threads", "scenes"),
     "compare": ("threads", "scenes", "model", "pretraining", "collection", "alignment", "evaluation"),

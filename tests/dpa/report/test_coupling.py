@@ -39,13 +39,13 @@ def braking(scene: Scene) -> Tensor:
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Figures that were saved."""
-    saved, save = [], coupling._save
+    saved, save = [], coupling.save_figure
 
     def keep(figure: Any, path: Any) -> None:
         saved.append(figure)
         save(figure, path)
 
-    monkeypatch.setattr(coupling, "_save", keep)
+    monkeypatch.setattr(coupling, "save_figure", keep)
     return saved
 
 

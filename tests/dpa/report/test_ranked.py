@@ -40,13 +40,13 @@ def rollouts(scene: Scene) -> Tensor:
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Figures that were saved."""
-    saved, save = [], ranked._save
+    saved, save = [], ranked.save_figure
 
     def keep(figure: Any, path: Any) -> None:
         saved.append(figure)
         save(figure, path)
 
-    monkeypatch.setattr(ranked, "_save", keep)
+    monkeypatch.setattr(ranked, "save_figure", keep)
     return saved
 
 
