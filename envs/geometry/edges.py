@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,6 +27,7 @@ _CELL_SIZES = (32.0, 8.0, 1.0)
 """Sides of the cells in which queries share their candidate segments, from coarse to fine [m]."""
 _MARGIN = 1e-6
 """Room for float32 rounding when a segment is ruled out for a cell, as a part of the largest coordinate."""
+_TINY = torch.finfo(torch.float32).tiny
 _NO_SEGMENT = -1
 
 
@@ -115,14 +118,14 @@ class RoadEdges:
         Raises:
             ValueError: a coordinate is not finite.
         """
-        flat = points.reshape(-1, 3)
+        flat = points.reshape(-1, 3).T.contiguous()
         if not torch.isfinite(flat).all():
-            bad = flat[~torch.isfinite(flat).all(-1)][0].tolist()
+            bad = flat[:, ~torch.isfinite(flat).all(0)][:, 0].tolist()
             raise ValueError(f"the distance to the road edge needs finite points, got {bad}; mask such points out.")
         segment = self._nearest_segment(flat)
-        _, residual = self._project(flat, segment)
-        distance = residual[0].square().add_(residual[1].square()).sqrt_()
-        signed = self._side(flat, segment) * distance
+        projection = self._project(flat, segment)
+        distance = projection.x.square().add_(projection.y.square()).sqrt_()
+        signed = self._side(flat, segment, projection).mul_(distance)
         if self.points_at_zero:
             signed = torch.where(self._beside_a_point(flat), 0, signed)
         return signed.view(points.shape[:-1])
@@ -144,78 +147,86 @@ class RoadEdges:
             >>> edges.box_offroad_distance(centre, torch.tensor(0.0), extent)
             tensor(0.5000)
         """
-        extent = extent.expand(position.shape)
-        corners = box_corners(torch.cat((position[..., :2], heading[..., None], extent[..., :2]), -1))
-        bottom = (position[..., 2] - extent[..., 2] / 2)[..., None].expand(corners.shape[:-1])
-        return self.signed_distance(torch.cat((corners, bottom[..., None]), -1)).amax(-1)
+        boxes = torch.cat((position, heading[..., None], extent.expand(position.shape)), -1).reshape(-1, 7)
+        # Half of all agents stand, and a box that repeats the one before it has the same distance.
+        new = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
+        new[1:] = (boxes[1:] != boxes[:-1]).any(-1)
+        moved = boxes[new]
+        corners = box_corners(moved[:, [0, 1, 3, 4, 5]])
+        bottom = (moved[:, 2] - moved[:, 6] / 2)[:, None, None].expand(-1, 4, 1)
+        distance = self.signed_distance(torch.cat((corners, bottom), -1)).amax(-1)
+        return distance[new.cumsum(0) - 1].view(position.shape[:-1])
 
-    def _project(self, points: Tensor, segment: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
-        """Where points fall along segments, and what is left between.
+    @cached_property
+    def _columns(self) -> tuple[Tensor, ...]:
+        """Start x, y, z, delta x, y, z and squared length in the plane, each ``[W]``; infinite in place of length 0."""
+        squared = self.delta[:, 0] * self.delta[:, 0] + self.delta[:, 1] * self.delta[:, 1]
+        squared = torch.where(squared > 0, squared, torch.inf)  # any point falls on the start, t = 0
+        return *self.start.T.contiguous(), *self.delta.T.contiguous(), squared
+
+    def _project(self, points: Tensor, segment: Tensor) -> _Projection:
+        """Project points onto segments in the plane.
 
         Args:
-            points: ``[n, 3]``.
-            segment: ``[n]`` or ``[n, W']`` int64.
-
-        Returns:
-            ``t`` of the shape of ``segment``, 0 at the start and 1 at the end, from the plane and not clipped; and the
-            three coordinates of the vector from the closest point of the segment.
+            points: ``[3, n]``.
+            segment: ``[n]`` or ``[c, n]`` int64.
         """
-        columns = points.T if segment.ndim == 1 else points.T[..., None]
-        dx, dy, dz = (column[segment] for column in self.delta.T.contiguous())
-        x, y, z = (q - a[segment] for q, a in zip(columns, self.start.T.contiguous(), strict=True))
-        squared = dx * dx + dy * dy
-        t = torch.where(squared > 0, (x * dx + y * dy) / squared, 0)
+        x, y, z, dx, dy, dz, squared = (
+            column.index_select(0, segment.flatten()).view(segment.shape) for column in self._columns
+        )
+        x, y, z = points[0] - x, points[1] - y, points[2] - z
+        t = (x * dx).add_(y * dy).div_(squared)
+        side = torch.sign((x * dy).sub_(y * dx)) if segment.dim() == 1 else None
         clipped = t.clamp(0, 1)
-        return t, (x - clipped * dx, y - clipped * dy, z - clipped * dz)
+        return _Projection(t, x.sub_(clipped * dx), y.sub_(clipped * dy), z.sub_(clipped * dz), side)
 
-    def _stretched_distance(self, points: Tensor, segment: Tensor) -> Tensor:
-        """Distance that chooses the nearest segment: ``[n, 3]``, ``[n, W']`` -> ``[n, W']``."""
-        _, (x, y, z) = self._project(points, segment)
-        z = self.height_stretch * z
-        # Segments of one map often tie but for the last bit. The float32 square root of torch is not rounded
-        # correctly, which breaks such ties at random; by way of float64 it is.
-        return (x * x + y * y + z * z).double().sqrt_().float()
+    def _first_nearest(self, points: Tensor, table: Tensor) -> Tensor:
+        """The first of the nearest ones among some segments: ``[3, n]``, ``[c, n]`` -> ``[n]``."""
+        near = self._project(points, table)
+        height = near.z.mul_(self.height_stretch)
+        squared = near.x.square_().add_(near.y.square_()).add_(height.square_())
+        # Segments of one map often tie but for the last bit, so it is their distances in float32 that are compared.
+        tied = squared <= _largest_of_same_root(squared.amin(0))
+        order = torch.arange(len(table), 0, -1, dtype=torch.int32, device=table.device)[:, None]
+        first = len(table) - tied.to(torch.int32).mul_(order).amax(0)
+        return table.gather(0, first[None].long())[0]
 
-    def _side(self, points: Tensor, segment: Tensor) -> Tensor:
-        """+1 right of the edge, -1 left: ``[n, 3]``, ``[n]`` -> ``[n]``.
+    def _side(self, points: Tensor, segment: Tensor, projection: _Projection) -> Tensor:
+        """+1 right of the edge, -1 left: ``[3, n]``, ``[n]`` -> ``[n]``.
 
         Beyond an end of the segment the neighbour has a say: the corner of a convex bend is right of the edge if the
         point is right of either segment, that of a concave bend only if it is right of both.
         """
-        t, _ = self._project(points, segment)
-        own = self._own_side(points, segment)
+        side = projection.side.clone()
 
-        def with_neighbour(neighbour: Tensor, first: Tensor, second: Tensor) -> Tensor:
-            side = self._own_side(points, neighbour)
+        def ask(neighbour: Tensor, beyond: Tensor, *, before: bool) -> None:
+            row = (beyond & (neighbour[segment] != _NO_SEGMENT)).nonzero()[:, 0]
+            own, other = segment[row], neighbour[segment[row]]
+            first, second = (other, own) if before else (own, other)
             convex = _cross(self.delta[first], self.delta[second]) > 0
-            return torch.where(convex, torch.maximum(own, side), torch.minimum(own, side))
+            mine, its = projection.side[row], self._project(points[:, row], other).side
+            side[row] = torch.where(convex, torch.maximum(mine, its), torch.minimum(mine, its))
 
-        previous, following = self.previous[segment], self.following[segment]
-        before = (t < 0) & (previous != _NO_SEGMENT)
-        after = (t > 1) & (following != _NO_SEGMENT)
-        side = torch.where(before, with_neighbour(previous, previous, segment), own)
-        return torch.where(after, with_neighbour(following, segment, following), side)
+        ask(self.previous, projection.t < 0, before=True)
+        ask(self.following, projection.t > 1, before=False)
+        return side
 
     def _beside_a_point(self, points: Tensor) -> Tensor:
-        """Queries whose nearest segment of some polyline has no length, and so no side: ``[n, 3]`` -> ``[n]``."""
-        hit = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+        """Queries whose nearest segment of some polyline has no length, and so no side: ``[3, n]`` -> ``[n]``."""
+        hit = torch.zeros_like(points[0], dtype=torch.bool)
         degenerate = (self.delta[:, :2] == 0).all(-1)
         for line in self.line[degenerate].unique():
-            own = (self.line == line).nonzero()[:, 0]
-            nearest = self._stretched_distance(points, own.expand(len(points), -1)).argmin(1)
-            hit |= degenerate[own[nearest]]
+            own = (self.line == line).nonzero()
+            hit |= degenerate[self._first_nearest(points, own.expand(-1, points.shape[1]))]
         return hit
 
-    def _own_side(self, points: Tensor, segment: Tensor) -> Tensor:
-        return torch.sign(_cross(points - self.start[segment], self.delta[segment]))
-
     def _nearest_segment(self, points: Tensor) -> Tensor:
-        """Index of the nearest segment, the first in map order on ties: ``[n, 3]`` -> ``[n]``.
+        """Index of the nearest segment, the first in map order on ties: ``[3, n]`` -> ``[n]``.
 
         Queries are gathered in boxes, from coarse to fine. Each box inherits the candidates of the coarser box around
         it and keeps those segments that can still be the nearest one of some point inside.
         """
-        if not len(points):
+        if not points.shape[1]:
             return torch.empty(0, dtype=torch.int64, device=points.device)
         levels, leaf = _nested_boxes(points)
         every = torch.arange(len(self.start), device=points.device)
@@ -224,31 +235,57 @@ class RoadEdges:
             candidates = self._narrow(candidates, level)
         nearest = torch.empty_like(leaf)
         for row, table, _ in candidates.tables(leaf):
-            best = self._stretched_distance(points[row], table).argmin(1, keepdim=True)
-            nearest[row] = table.gather(1, best)[:, 0]
+            nearest[row] = self._first_nearest(points[:, row], table)
         return nearest
 
     def _narrow(self, candidates: Ragged, boxes: _Boxes) -> Ragged:
         """Candidates of each box among those of the coarser box around it.
 
-        A segment stays if its least distance inside the box is within the greatest one of every other segment. Inside
-        the box a query moves by at most ``radius`` in the plane and ``half_z`` in height. The distance in the plane
-        changes by no more than the radius, the height above the segment by no more than ``half_z`` and the rise of the
-        segment under a point that moves by the radius.
+        Let ``v`` lead from the place on a segment that is nearest to the centre of the box to that centre, height
+        stretched, and ``D`` be its length. As the query moves by ``o`` from the centre, the distance becomes at least
+        ``D + o . v / D``, for it is convex, and at most ``|v + o|``, hence at most ``D + o . v / D + o . o / 2D`` and
+        at most ``D + |o|``. A segment stays if its lower bound is within the upper bound of the segment that is nearest
+        to the centre somewhere in the box. What a segment rises or falls under the query comes on top of both.
         """
-        radius, half_z = boxes.half[:, :2].norm(dim=-1), boxes.half[:, 2]
+        stretch = self.height_stretch
+        half = (boxes.half[0], boxes.half[1], stretch * boxes.half[2])
+        radius, reach = torch.hypot(*half[:2]), torch.stack(half).norm(dim=0)
         length = self.delta[:, :2].norm(dim=-1)
-        slope = torch.where(length > 0, self.delta[:, 2].abs() / length, 0)
+        slope = torch.where(length > 0, stretch * self.delta[:, 2].abs() / length, 0)
+        climb = stretch * self.delta[:, 2].abs()
         margin = _MARGIN * (1 + max(boxes.centre.abs().max(), self.start.abs().max()))
         parts = []
         for row, table, real in candidates.tables(boxes.parent):
-            distance = self._stretched_distance(boxes.centre[row], table)
-            rise = torch.minimum(slope[table] * radius[row, None], self.delta[:, 2].abs()[table])
-            slack = torch.hypot(radius[row, None], self.height_stretch * (half_z[row, None] + rise))
-            reach = (distance + slack).amin(1, keepdim=True) * (1 + _MARGIN) + margin
-            keep = real & (distance - slack <= reach)
-            parts.append((row, keep.sum(1), table[keep]))
+            near = self._project(boxes.centre[:, row], table)
+            away = (near.x, near.y, near.z.mul_(stretch))
+            distance = (away[0].square() + away[1].square() + away[2].square()).sqrt_()
+            least, nearest = distance.min(0, keepdim=True)
+            spread = torch.zeros_like(distance)
+            for component, side in zip(away, half, strict=True):
+                towards = component / distance.clamp(min=_TINY)
+                spread += (towards - towards.gather(0, nearest)).abs_() * side[row]
+            spread += reach[row].square() / (2 * least)
+            rise = torch.minimum(slope[table] * radius[row], climb[table])
+            bound = torch.minimum(spread, 2 * reach[row]).add_(least + rise.gather(0, nearest)).add_(rise)
+            keep = (real & (distance <= bound.mul_(1 + _MARGIN).add_(margin))).T.contiguous()
+            parts.append((row, keep.sum(1), table.T[keep]))
         return Ragged.from_parts(len(boxes.parent), parts)
+
+
+class _Projection(NamedTuple):
+    """Points projected onto segments in the plane, each of the shape of the segments.
+
+    Attributes:
+        t: 0 at the start of the segment and 1 at its end, not clipped.
+        x: of what lies between the point and the nearest place of the segment [m], as ``y`` and ``z``.
+        side: +1 right of the segment's line, -1 left; None for tables of segments, which do without.
+    """
+
+    t: Tensor
+    x: Tensor
+    y: Tensor
+    z: Tensor
+    side: Tensor | None
 
 
 @dataclass(frozen=True)
@@ -256,8 +293,8 @@ class _Boxes:
     """One level of nested boxes of query points.
 
     Attributes:
-        centre: ``[m, 3]`` [m].
-        half: ``[m, 3]``, half sides, no larger than the points inside need [m].
+        centre: ``[3, m]`` [m].
+        half: ``[3, m]``, half sides, no larger than the points inside need [m].
         parent: ``[m]`` int64, the box of the coarser level around each.
     """
 
@@ -267,20 +304,20 @@ class _Boxes:
 
 
 def _nested_boxes(points: Tensor) -> tuple[list[_Boxes], Tensor]:
-    """Gather ``[n, 3]`` points in boxes; the levels from coarse to fine, and the finest box ``[n]`` of each point."""
+    """Gather ``[3, n]`` points in boxes; the levels from coarse to fine, and the finest box ``[n]`` of each point."""
     low = high = points
     inner_to_outer: list[Tensor] = []
     sides: list[tuple[Tensor, Tensor]] = []
     for size in reversed(_CELL_SIZES):
         cell, owner = torch.unique(_cell_key(low, size), return_inverse=True)
-        index = owner[:, None].expand(-1, 3)
-        box = low.new_empty(len(cell), 3)
-        low = box.scatter_reduce(0, index, low, "amin", include_self=False)
-        high = box.scatter_reduce(0, index, high, "amax", include_self=False)
+        index = owner.expand(3, -1)
+        box = low.new_empty(3, len(cell))
+        low = box.scatter_reduce(1, index, low, "amin", include_self=False)
+        high = box.scatter_reduce(1, index, high, "amax", include_self=False)
         inner_to_outer.append(owner)
         sides.append((low, high))
     leaf, *parents = inner_to_outer
-    parents.append(torch.zeros(len(low), dtype=torch.int64, device=points.device))
+    parents.append(torch.zeros_like(low[0], dtype=torch.int64))
     levels = [
         _Boxes((low + high) / 2, (high - low) / 2, parent) for (low, high), parent in zip(sides, parents, strict=True)
     ]
@@ -288,11 +325,24 @@ def _nested_boxes(points: Tensor) -> tuple[list[_Boxes], Tensor]:
 
 
 def _cell_key(points: Tensor, size: float) -> Tensor:
-    """One int64 for the cell of each point, ``[n, 3]`` -> ``[n]``; far cells share a key, which costs only time."""
-    sides = torch.tensor([size, size, size / (2 * HEIGHT_STRETCH)], device=points.device)
+    """One int64 for the cell of each point, ``[3, n]`` -> ``[n]``; far cells share a key, which costs only time."""
+    sides = torch.tensor([[size], [size], [size / (2 * HEIGHT_STRETCH)]], device=points.device)
     limit = 1 << 20
-    x, y, z = (points / sides).floor().clamp(-limit, limit - 1).long().add_(limit).unbind(-1)
+    x, y, z = (points / sides).floor_().clamp_(-limit, limit - 1).long().add_(limit)
     return (x * 2 * limit + y) * 2 * limit + z
+
+
+def _largest_of_same_root(squared: Tensor) -> Tensor:
+    """The largest float32 whose root, rounded to float32, is that of the given one: ``[n]`` -> ``[n]``.
+
+    The float32 square root of torch is not rounded correctly; by way of float64 it is. What rounds to a root lies below
+    the middle between it and the next number, whose square float64 holds exactly.
+    """
+    root = squared.double().sqrt_().float()
+    above = torch.nextafter(root, torch.full_like(root, torch.inf))
+    limit = root.double().add_(above).div_(2).square_()
+    rounded = limit.float()
+    return torch.where(rounded > limit, torch.nextafter(rounded, torch.zeros_like(rounded)), rounded)
 
 
 def _cross(first: Tensor, second: Tensor) -> Tensor:

@@ -26,7 +26,7 @@ class Ragged:
     Examples:
         >>> lists = Ragged.from_parts(2, [(torch.tensor([1, 0]), torch.tensor([1, 2]), torch.tensor([7, 8, 9]))])
         >>> [(row.tolist(), table.tolist()) for row, table, _ in lists.tables(torch.tensor([0, 1, 0]))]
-        [([1], [[7]]), ([0, 2], [[8, 9], [8, 9]])]
+        [([1], [[7]]), ([0, 2], [[8, 8], [9, 9]])]
     """
 
     values: Tensor
@@ -55,8 +55,9 @@ class Ragged:
             chosen: ``[n]`` int64, a list for each row; a list may be chosen many times.
 
         Yields:
-            Row indices ``[k]`` into ``chosen``; a table ``[k, c]`` of their lists, the last value repeated to width;
-            and a mask ``[k, c]`` of what is not repeated. Each row comes in exactly one table.
+            Row indices ``[k]`` into ``chosen``; a table ``[c, k]`` with their lists as columns, the last value repeated
+            to the common length; and a mask ``[c, k]`` of what is not repeated. Each row comes in exactly one table.
+            Lists are columns since there are more of them than entries in one: work along them is what is fast.
         """
         widths = _widths(int(self.count.max()), self.count.device)
         width_class = torch.searchsorted(widths, self.count)[chosen]
@@ -64,11 +65,12 @@ class Ragged:
             torch.bincount(width_class, minlength=len(widths)).tolist()
         )
         for width, rows in zip(widths.tolist(), rows_by_class, strict=True):
-            column = torch.arange(width, device=self.count.device)
+            entry = torch.arange(width, device=self.count.device)[:, None]
             for row in rows.split(max(1, _ENTRIES_PER_TABLE // width)) if len(rows) else ():
                 lists = chosen[row]
-                last = self.count[lists, None] - 1
-                yield row, self.values[self.start[lists, None] + torch.minimum(column, last)], column <= last
+                last = self.count[lists] - 1
+                place = torch.minimum(entry, last).add_(self.start[lists])
+                yield row, self.values.index_select(0, place.flatten()).view(place.shape), entry <= last
 
 
 def _widths(longest: int, device: torch.device) -> Tensor:
