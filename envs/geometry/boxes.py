@@ -17,8 +17,10 @@ NOBODY = 1e10
 """Distance to the nearest box where there is none [m]."""
 
 _CORNERS = ((0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5), (0.5, -0.5))
-_PAIRS_PER_CHUNK = 1 << 17
-"""Pairs handled together: small enough for the working set to stay in a core's cache."""
+_CIRCLES_PER_CHUNK = 1 << 17
+"""Pairs of circles compared together: small enough for the working set to stay in a core's cache."""
+_BOXES_PER_CHUNK = 1 << 14
+"""Pairs of boxes measured together, for the same reason."""
 _BOUND_MARGIN = 1e-3
 """Room for float32 rounding when a pair is ruled out by its circles [m]."""
 
@@ -64,14 +66,15 @@ def signed_box_distance(first: Tensor, second: Tensor, rounding: float = CORNER_
     seen_by_first = rotate(offset, -first[..., 2])
     seen_by_second = rotate(-offset, -second[..., 2])
     turn = second[..., 2] - first[..., 2]
+    cos, sin = turn.cos(), turn.sin()
 
     overlap = torch.maximum(
-        _separation(seen_by_first, core_first, core_second, turn),
-        _separation(seen_by_second, core_second, core_first, turn),
+        _separation(seen_by_first, core_first, core_second, cos, sin),
+        _separation(seen_by_second, core_second, core_first, cos, sin),
     )
     gap = torch.minimum(
-        _corner_gap(seen_by_first, core_first, core_second, turn),
-        _corner_gap(seen_by_second, core_second, core_first, -turn),
+        _corner_gap(seen_by_first, core_first, core_second, cos, sin),
+        _corner_gap(seen_by_second, core_second, core_first, cos, -sin),
     )
     return torch.where(overlap <= 0, overlap, gap) - radius_first - radius_second
 
@@ -105,41 +108,67 @@ def nearest_box_distance(
         )
     ego = torch.arange(num_agents, device=boxes.device) if ego is None else ego
     flat, flat_valid = boxes.reshape(-1, num_agents, 5), valid.reshape(-1, num_agents)
-    rows = max(1, _PAIRS_PER_CHUNK // max(1, num_agents * len(ego)))
-    nearest = [
-        _nearest_of_chunk(part, part_valid, ego, rounding)
-        for part, part_valid in zip(flat.split(rows), flat_valid.split(rows), strict=True)
-    ]
-    return torch.cat(nearest).reshape(*boxes.shape[:-2], len(ego))
+    ego_row, other = _candidates(flat, flat_valid, ego, rounding)
+    flat = flat.reshape(-1, 5)
+    nearest = boxes.new_full((len(flat_valid) * len(ego),), NOBODY)
+    for row, second in zip(ego_row.split(_BOXES_PER_CHUNK), other.split(_BOXES_PER_CHUNK), strict=True):
+        first = row // len(ego) * num_agents + ego[row % len(ego)]
+        distance = signed_box_distance(flat.index_select(0, first), flat.index_select(0, second), rounding)
+        nearest.scatter_reduce_(0, row, distance, "amin")
+    return nearest.view(*boxes.shape[:-2], len(ego))
 
 
-def _nearest_of_chunk(boxes: Tensor, valid: Tensor, ego: Tensor, rounding: float) -> Tensor:
-    """:func:`nearest_box_distance` of ``[M, A, 5]`` boxes -> ``[M, E]``."""
-    num_scenes, num_agents = valid.shape
-    x, y = boxes[..., 0], boxes[..., 1].masked_fill(~valid, NOBODY)
-    dx = x[:, ego, None] - x[:, None, :]
-    dy = boxes[:, ego, None, 1] - y[:, None, :]
-    centre = dx.square_().addcmul_(dy, dy).sqrt_()
-    centre[:, torch.arange(len(ego)), ego] = NOBODY
-
+def _candidates(boxes: Tensor, valid: Tensor, ego: Tensor, rounding: float) -> tuple[Tensor, Tensor]:
+    """Pairs that can be nearest, of ``[M, A, 5]`` boxes: rows of ``[M * E]`` egos, rows of ``[M * A]`` boxes."""
     inner = boxes[..., 3:5].amin(-1) / 2
     corner = _corner_radius(boxes, rounding)
-    outer = _core_half(boxes, corner).norm(dim=-1) + corner
-    upper = (centre - inner[:, None, :]).amin(-1) - inner[:, ego]
-    reach = upper + outer[:, ego] + _BOUND_MARGIN
-    # an ego that is not there has no candidate at all
-    reach = torch.where(valid[:, ego], reach.clamp(max=NOBODY / 10), -torch.inf)
-    candidate = centre.sub_(outer[:, None, :]) <= reach[..., None]
+    circles = torch.stack((boxes[..., 0], boxes[..., 1], inner, _core_half(boxes, corner).norm(dim=-1) + corner))
+    circles = circles.flatten(1)
+    # Who is not there costs nothing: those who are come first, and scenes with as many of them go together.
+    there, ego_there = (mask.byte().argsort(dim=-1, descending=True, stable=True) for mask in (valid, valid[:, ego]))
+    count, ego_count = valid.sum(-1), valid[:, ego].sum(-1)
+    place = torch.empty_like(there).scatter_(1, there, torch.arange(valid.shape[1], device=ego.device).expand_as(there))
+    scenes = count.argsort(descending=True, stable=True)
+    found = [(scenes[:0], scenes[:0])]
+    while len(scenes) and (width := int(count[scenes[0]])):
+        rows = max(1, _CIRCLES_PER_CHUNK // (width * max(1, len(ego))))
+        scene, scenes = scenes[:rows], scenes[rows:]
+        column = ego_there[scene, : int(ego_count[scene].max())]
+        first, second = (scene[:, None] * valid.shape[1] + one for one in (ego[column], there[scene, :width]))
+        near = _near_circles(
+            *(circles.index_select(1, row.flatten()).view(4, *row.shape) for row in (first, second)),
+            *(valid.flatten()[row] for row in (first, second)),
+            place.flatten()[first].clamp(max=width - 1),
+        )
+        pair = near.flatten().nonzero()[:, 0]
+        ego_row, row = (scene[:, None] * len(ego) + column).flatten()[pair // width], pair // (width * column.shape[1])
+        found.append((ego_row, second.flatten()[row * width + pair % width]))
+    ego_row, other = (torch.cat(part) for part in zip(*found, strict=True))
+    return ego_row, other
 
-    pair = candidate.flatten().nonzero()[:, 0]
-    ego_row = pair // num_agents
-    scene, other = ego_row // len(ego), pair % num_agents
-    all_boxes = boxes.reshape(-1, 5)
-    first = all_boxes[scene * num_agents + ego[ego_row % len(ego)]]
-    second = all_boxes[scene * num_agents + other]
-    nearest = boxes.new_full((num_scenes * len(ego),), NOBODY)
-    nearest.scatter_reduce_(0, ego_row, signed_box_distance(first, second, rounding), "amin")
-    return nearest.view(num_scenes, len(ego))
+
+def _near_circles(first: Tensor, second: Tensor, first_there: Tensor, second_there: Tensor, itself: Tensor) -> Tensor:
+    """Which of some boxes can be the nearest one.
+
+    Args:
+        first: ``[4, m, e]``, x, y, radius of the inscribed circle, radius of the circumscribed one.
+        second: ``[4, m, a]``.
+        first_there: ``[m, e]`` bool.
+        second_there: ``[m, a]`` bool.
+        itself: ``[m, e]`` int64, where the first is found among the second.
+
+    Returns:
+        ``[m, e, a]`` bool.
+    """
+    x, y, inner, outer = second[:, :, None]
+    dx = first[0, ..., None] - x
+    dy = first[1, ..., None] - y.masked_fill(~second_there[:, None], NOBODY)
+    centre = dx.square_().addcmul_(dy, dy).sqrt_().scatter_(2, itself[..., None], NOBODY)
+    upper = (centre - inner).amin(-1) - first[2]
+    reach = upper + first[3] + _BOUND_MARGIN
+    # an ego that is not there has no candidate at all
+    reach = torch.where(first_there, reach.clamp(max=NOBODY / 10), -torch.inf)
+    return centre.sub_(outer) <= reach[..., None]
 
 
 def _corner_radius(box: Tensor, rounding: float) -> Tensor:
@@ -151,27 +180,26 @@ def _core_half(box: Tensor, radius: Tensor) -> Tensor:
     return box[..., 3:5] / 2 - radius[..., None]
 
 
-def _separation(offset: Tensor, own: Tensor, other: Tensor, turn: Tensor) -> Tensor:
+def _separation(offset: Tensor, own: Tensor, other: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
     """Widest gap between two rectangles along the axes of the first; negative where both axes overlap.
 
     Args:
         offset: ``[..., 2]``, centre of the second in the frame of the first.
         own: ``[..., 2]``, half sides of the first.
         other: ``[..., 2]``, half sides of the second.
-        turn: ``[...]``, angle between them.
+        cos: ``[...]``, of the angle from the first to the second, as ``sin``.
     """
-    cos, sin = turn.cos().abs(), turn.sin().abs()
+    cos, sin = cos.abs(), sin.abs()
     along = offset[..., 0].abs() - own[..., 0] - (other[..., 0] * cos + other[..., 1] * sin)
     across = offset[..., 1].abs() - own[..., 1] - (other[..., 0] * sin + other[..., 1] * cos)
     return torch.maximum(along, across)
 
 
-def _corner_gap(offset: Tensor, own: Tensor, other: Tensor, turn: Tensor) -> Tensor:
+def _corner_gap(offset: Tensor, own: Tensor, other: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
     """Distance from the first rectangle to the nearest corner of the second (arguments of :func:`_separation`).
 
     Two rectangles that do not overlap are nearest at a corner of one of them.
     """
-    cos, sin = turn.cos(), turn.sin()
     length, width = torch.stack((cos, sin), -1) * other[..., :1], torch.stack((-sin, cos), -1) * other[..., 1:]
     gap = None
     for front, left in _CORNERS:

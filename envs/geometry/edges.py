@@ -235,7 +235,7 @@ class RoadEdges:
             candidates = self._narrow(candidates, level)
         nearest = torch.empty_like(leaf)
         for row, table, _ in candidates.tables(leaf):
-            nearest[row] = self._first_nearest(points[:, row], table)
+            nearest[row] = self._first_nearest(points.index_select(1, row), table)
         return nearest
 
     def _narrow(self, candidates: Ragged, boxes: _Boxes) -> Ragged:
@@ -311,9 +311,8 @@ def _nested_boxes(points: Tensor) -> tuple[list[_Boxes], Tensor]:
     for size in reversed(_CELL_SIZES):
         cell, owner = torch.unique(_cell_key(low, size), return_inverse=True)
         index = owner.expand(3, -1)
-        box = low.new_empty(3, len(cell))
-        low = box.scatter_reduce(1, index, low, "amin", include_self=False)
-        high = box.scatter_reduce(1, index, high, "amax", include_self=False)
+        low = low.new_full((3, len(cell)), torch.inf).scatter_reduce_(1, index, low, "amin")
+        high = high.new_full((3, len(cell)), -torch.inf).scatter_reduce_(1, index, high, "amax")
         inner_to_outer.append(owner)
         sides.append((low, high))
     leaf, *parents = inner_to_outer

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-_ENTRIES_PER_TABLE = 1 << 17
+_ENTRIES_PER_TABLE = 1 << 16
 """Entries of one table: small enough for the work on it to stay in a core's cache."""
 _GROWTH = 1.25
 """Lists whose lengths differ by less than this factor share a table."""
@@ -60,7 +60,7 @@ class Ragged:
             Lists are columns since there are more of them than entries in one: work along them is what is fast.
         """
         widths = _widths(int(self.count.max()), self.count.device)
-        width_class = torch.searchsorted(widths, self.count)[chosen]
+        width_class = torch.searchsorted(widths, self.count).short()[chosen]  # short numbers sort faster
         rows_by_class = torch.argsort(width_class, stable=True).split(
             torch.bincount(width_class, minlength=len(widths)).tolist()
         )

@@ -28,19 +28,53 @@ def random_lines(seed: int) -> list[torch.Tensor]:
     return lines
 
 
-@given(seed=st.integers(0, 10_000), origin=st.sampled_from([0.0, 5000.0]))
-@settings(max_examples=15, deadline=None)
-def test_culling_finds_the_segment_that_brute_force_finds(seed: int, origin: float) -> None:
-    shift = torch.tensor([origin, -origin, 0.0])
-    edges = RoadEdges.from_polylines([line + shift for line in random_lines(seed)])
+def nearest_of_all(edges: RoadEdges, points: torch.Tensor) -> torch.Tensor:
+    """The first of the segments at the least distance in float32, height stretched, by looking at all of them."""
+    x, y, z = (points[:, None] - edges.start).unbind(-1)
+    dx, dy, dz = edges.delta.unbind(-1)
+    squared = dx * dx + dy * dy
+    t = torch.where(squared > 0, (x * dx + y * dy) / squared, 0).clamp(0, 1)
+    x, y, z = x - t * dx, y - t * dy, edges.height_stretch * (z - t * dz)
+    return (x * x + y * y + z * z).double().sqrt().float().argmin(1)
+
+
+@given(
+    seed=st.integers(0, 10_000),
+    origin=st.sampled_from([0.0, 5000.0]),
+    steepness=st.sampled_from([0.0, 1.0, 20.0]),
+    stretch=st.sampled_from([0.0, 3.0]),
+)
+@settings(max_examples=30, deadline=None)
+def test_culling_finds_the_segment_that_brute_force_finds(
+    seed: int, origin: float, steepness: float, stretch: float
+) -> None:
+    shift, scale = torch.tensor([origin, -origin, 0.0]), torch.tensor([1.0, 1.0, steepness])
+    lines = [line * scale + shift for line in random_lines(seed)]
+    edges = RoadEdges.from_polylines(lines, height_stretch=stretch)
     generator = torch.Generator().manual_seed(seed + 1)
     near = edges.start[torch.randint(len(edges.start), (300,), generator=generator)]
     near = near + torch.randn(300, 3, generator=generator) * torch.tensor([3.0, 3.0, 1.0])
     far = torch.randn(100, 3, generator=generator) * torch.tensor([200.0, 200.0, 20.0]) + shift
-    points = torch.cat((near, far, edges.start))
-    every = torch.arange(len(edges.start)).expand(len(points), -1)
-    expected = edges._stretched_distance(points, every).argmin(1)
-    assert torch.equal(edges._nearest_segment(points), expected)
+    crowd = near[:1] + torch.randn(300, 3, generator=generator) * torch.tensor([0.3, 0.3, 0.02])
+    points = torch.cat((near, far, crowd, edges.start))
+    assert torch.equal(edges._nearest_segment(points.T.contiguous()), nearest_of_all(edges, points))
+
+
+def test_of_segments_that_tie_the_first_one_in_map_order_is_nearest() -> None:
+    line = torch.tensor([[0.0, 0, 0], [10, 0, 0]])
+    edges = RoadEdges.from_polylines([line + torch.tensor([0.0, y, 0]) for y in (2.0, -2, 2, -2)])
+    points = torch.tensor([[1.0, 0, 0], [5, 0, 0], [5, -3, 0]])
+    assert edges._nearest_segment(points.T.contiguous()).tolist() == [0, 0, 1]
+
+
+def test_boxes_that_stand_still_have_the_distance_of_each_on_its_own() -> None:
+    edges = RoadEdges.from_polylines(random_lines(3))
+    generator = torch.Generator().manual_seed(0)
+    position, heading = torch.randn(5, 3, generator=generator) * 20, torch.randn(5, generator=generator)
+    extent = torch.rand(5, 3, generator=generator) + 1
+    one_by_one = torch.stack([edges.box_offroad_distance(*box) for box in zip(position, heading, extent, strict=True)])
+    standing = edges.box_offroad_distance(*(value.repeat_interleave(4, 0) for value in (position, heading, extent)))
+    assert torch.equal(standing, one_by_one.repeat_interleave(4))
 
 
 def test_left_of_an_edge_is_on_the_road() -> None:
