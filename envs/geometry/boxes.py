@@ -187,7 +187,8 @@ def _separation(offset: Tensor, own: Tensor, other: Tensor, cos: Tensor, sin: Te
         offset: ``[..., 2]``, centre of the second in the frame of the first.
         own: ``[..., 2]``, half sides of the first.
         other: ``[..., 2]``, half sides of the second.
-        cos: ``[...]``, of the angle from the first to the second, as ``sin``.
+        cos: ``[...]``, of the angle from the first to the second.
+        sin: ``[...]``, of the same.
     """
     cos, sin = cos.abs(), sin.abs()
     along = offset[..., 0].abs() - own[..., 0] - (other[..., 0] * cos + other[..., 1] * sin)

@@ -264,7 +264,7 @@ class RoadEdges:
             for component, side in zip(away, half, strict=True):
                 towards = component / distance.clamp(min=_TINY)
                 spread += (towards - towards.gather(0, nearest)).abs_() * side[row]
-            spread += reach[row].square() / (2 * least)
+            spread += reach[row].square() / (2 * least).clamp(min=_TINY)
             rise = torch.minimum(slope[table] * radius[row], climb[table])
             bound = torch.minimum(spread, 2 * reach[row]).add_(least + rise.gather(0, nearest)).add_(rise)
             keep = (real & (distance <= bound.mul_(1 + _MARGIN).add_(margin))).T.contiguous()
