@@ -5,7 +5,6 @@ Sections refer to the specification of the Waymo Open Sim Agents metric (SPEC).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -19,20 +18,12 @@ from dpa.realism.quirks import Quirk
 from dpa.realism.tracks import HORIZON, Comparison, Tracks, stack
 from envs.geometry.boxes import nearest_box_distance
 from envs.geometry.edges import RoadEdges
-from envs.geometry.frames import rotate, wrap_angle
+from envs.geometry.following import time_to_collision
+from envs.geometry.frames import wrap_angle
 from envs.scene import EDGE_KINDS, STEP_SECONDS, Scene, polylines
 
 _OFF_MAP = -1e10
 """Distance to the road edge of an agent that is not there [m]."""
-
-_LONGEST_TTC = 5.0
-"""Time to collision is cut at this value [s]."""
-_FOLLOW_ANGLE = math.radians(75)
-"""A leader's heading differs by at most this angle [rad]."""
-_FOLLOW_ANGLE_SMALL_OVERLAP = math.radians(10)
-"""The same where the two overlap sideways by less than :data:`_SMALL_OVERLAP` [rad]."""
-_SMALL_OVERLAP = 0.5
-"""Overlap sideways below which a leader must be nearly parallel [m]."""
 
 
 @dataclass(frozen=True)
@@ -173,23 +164,15 @@ def _time_to_collision(tracks: Tracks, config: RealismConfig) -> Tensor:
     speed = _speed(tracks.position[..., :2], config.differences)[..., tracks.scored]
     position, heading = tracks.position[:, :, tracks.scored, :2], tracks.heading[:, :, tracks.scored]
     valid = tracks.valid[:, :, tracks.scored]
-    length, width = tracks.extent[..., 0, None], tracks.extent[..., 1, None]
-    result = []
-    for ego in range(tracks.num_ego):
-        turn = heading - heading[:, ego, None]
-        if Quirk.UNWRAPPED_TURN not in config.quirks:
-            turn = wrap_angle(turn)
-        turn = turn.abs()
-        cos, sin = turn.cos().abs(), turn.sin().abs()
-        ahead, aside = rotate(position - position[:, ego, None], -heading[:, ego, None]).unbind(-1)
-        gap = ahead - length[:, ego, None] / 2 - (length * cos + width * sin) / 2
-        overlap = aside.abs() - width[:, ego, None] / 2 - (length * sin + width * cos) / 2
-        aligned = (turn <= _FOLLOW_ANGLE) & ((overlap < -_SMALL_OVERLAP) | (turn <= _FOLLOW_ANGLE_SMALL_OVERLAP))
-        followed = (gap > 0) & (overlap < 0) & aligned & valid
-        nearest, leader = torch.where(followed, gap, torch.inf).min(1)
-        closing = speed[:, ego] - speed.gather(1, leader[:, None])[:, 0]
-        result.append(torch.where(closing > 0, (nearest / closing).clamp(max=_LONGEST_TTC), _LONGEST_TTC))
-    return torch.stack(result, 1)
+    return time_to_collision(
+        position,
+        heading,
+        speed,
+        tracks.extent,
+        valid,
+        torch.arange(tracks.num_ego),
+        unwrapped_turn=Quirk.UNWRAPPED_TURN in config.quirks,
+    )
 
 
 def _road_edge(tracks: Tracks, scene: Scene, config: RealismConfig) -> Tensor:

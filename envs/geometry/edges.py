@@ -118,10 +118,7 @@ class RoadEdges:
         Raises:
             ValueError: a coordinate is not finite.
         """
-        flat = points.reshape(-1, 3).T.contiguous()
-        if not torch.isfinite(flat).all():
-            bad = flat[:, ~torch.isfinite(flat).all(0)][:, 0].tolist()
-            raise ValueError(f"the distance to the road edge needs finite points, got {bad}; mask such points out.")
+        flat = _finite_columns(points)
         segment = self._nearest_segment(flat)
         projection = self._project(flat, segment)
         distance = projection.x.square().add_(projection.y.square()).sqrt_()
@@ -129,6 +126,30 @@ class RoadEdges:
         if self.points_at_zero:
             signed = torch.where(self._beside_a_point(flat), 0, signed)
         return signed.view(points.shape[:-1])
+
+    def nearest(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Distance in the plane to the nearest line, and the direction of its segment there.
+
+        Args:
+            points: ``[..., 3]`` [m].
+
+        Returns:
+            ``[...]`` [m], 0 or more; ``[...]`` [rad].
+
+        Raises:
+            ValueError: a coordinate is not finite.
+
+        Examples:
+            >>> lane = RoadEdges.from_polylines([torch.tensor([[0.0, 0, 0], [0, 10, 0]])])
+            >>> lane.nearest(torch.tensor([2.0, 5.0, 0.0]))
+            (tensor(2.), tensor(1.5708))
+        """
+        flat = _finite_columns(points)
+        segment = self._nearest_segment(flat)
+        projection = self._project(flat, segment)
+        dx, dy, _ = self.delta[segment].unbind(-1)
+        distance, direction = torch.hypot(projection.x, projection.y), torch.atan2(dy, dx)
+        return distance.view(points.shape[:-1]), direction.view(points.shape[:-1])
 
     def box_offroad_distance(self, position: Tensor, heading: Tensor, extent: Tensor) -> Tensor:
         """Signed distance of the bottom corner that is farthest off the road.
@@ -301,6 +322,15 @@ class _Boxes:
     centre: Tensor
     half: Tensor
     parent: Tensor
+
+
+def _finite_columns(points: Tensor) -> Tensor:
+    """Points ``[..., 3]`` as ``[3, n]``, refused where one is not finite."""
+    flat = points.reshape(-1, 3).T.contiguous()
+    if not torch.isfinite(flat).all():
+        bad = flat[:, ~torch.isfinite(flat).all(0)][:, 0].tolist()
+        raise ValueError(f"the distance to the road edge needs finite points, got {bad}; mask such points out.")
+    return flat
 
 
 def _nested_boxes(points: Tensor) -> tuple[list[_Boxes], Tensor]:
