@@ -4,7 +4,7 @@
 ``displacement`` is its rival; ``transform`` puts both behind a collector.
 """
 
-from dpa.ranking.displacement import Displacement, average_displacement
+from dpa.ranking.displacement import Displacement, average_displacement, final_displacement
 from dpa.ranking.distance import AGGREGATES, PreferenceDistance, Ranking, rank_of
 from dpa.ranking.features import FEATURE_SETS, FEATURES, Feature, Motion, log_trajectory, occupancy_features, register
 from dpa.ranking.transport import SOLVERS, Transport, feature_shares, transport_cost
@@ -22,6 +22,7 @@ __all__ = [
     "Transport",
     "average_displacement",
     "feature_shares",
+    "final_displacement",
     "log_trajectory",
     "occupancy_features",
     "rank_of",

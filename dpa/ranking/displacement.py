@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 class Displacement(NamedTuple):
-    """Mean displacement of rollouts from the log."""
+    """Displacement of rollouts from the log."""
 
     agent: Tensor
     """``[R, A]`` [m]; 0 where the agent has no valid logged step."""
@@ -39,13 +39,36 @@ def average_displacement(position: Tensor, log: Tensor, valid: Tensor) -> Displa
         >>> average_displacement(rollout[None], log, valid).agent
         tensor([[5.]])
     """
+    error = _error(position, log, valid)
+    return _over_agents(error.sum(-1) / valid.sum(-1).clamp_min(1), valid)
+
+
+def final_displacement(position: Tensor, log: Tensor, valid: Tensor) -> Displacement:
+    """Final displacement error (FDE): that of each agent's last valid logged step.
+
+    Arguments and errors are those of :func:`average_displacement`.
+
+    Examples:
+        >>> log, valid = torch.zeros(1, 3, 2), torch.tensor([[True, True, False]])
+        >>> rollout = torch.tensor([[[[1.0, 0], [2, 0], [9, 0]]]])
+        >>> final_displacement(rollout, log, valid).agent
+        tensor([[2.]])
+    """
+    error = _error(position, log, valid)
+    last = (valid * torch.arange(valid.shape[-1], device=valid.device)).argmax(-1)
+    return _over_agents(error.gather(-1, last.expand(len(error), -1)[..., None])[..., 0], valid)
+
+
+def _error(position: Tensor, log: Tensor, valid: Tensor) -> Tensor:
+    """Distance from the log in the plane, ``[R, A, T]`` [m]; 0 where the log is not valid."""
     if position.shape[1:3] != log.shape[:2] or valid.shape != log.shape[:2]:
         raise ValueError(
             f"rollouts, log and mask need the same agents and steps, got {tuple(position.shape[1:3])}, "
             f"{tuple(log.shape[:2])} and {tuple(valid.shape)}."
         )
-    error = torch.linalg.vector_norm(position[..., :2] - log[..., :2], dim=-1)
-    error = torch.where(valid, error, 0.0)
-    agent = error.sum(-1) / valid.sum(-1).clamp_min(1)
+    return torch.where(valid, torch.linalg.vector_norm(position[..., :2] - log[..., :2], dim=-1), 0.0)
+
+
+def _over_agents(agent: Tensor, valid: Tensor) -> Displacement:
     ranked = valid.any(-1)
     return Displacement(agent, agent.sum(-1) / ranked.sum().clamp_min(1), ranked)

@@ -16,7 +16,7 @@ from envs.scene import LANE_KINDS, STEP_SECONDS, polylines
 from envs.signals import SignalMap
 
 
-@register("red_light", unit="1", clip=(0.0, 1.0), weight=10.0, spread=1.0, past=1)
+@register("red_light", unit="1", clip=(0.0, 1.0), weight=10.0, spread=0.041, past=1)
 def red_light(motion: Motion) -> Tensor:
     """1 at the step at which the agent passes the stop point of its lane while the light is red (SPEC section 4.2).
 
@@ -32,13 +32,13 @@ def red_light(motion: Motion) -> Tensor:
     return crosses_red(road.lanes, lane_id, red, stop, position, valid)[:, :, motion.steps - 1].float()
 
 
-@register("lane_deviation", unit="m", clip=(0.0, 10.0), weight=1.0, spread=1.0)
+@register("lane_deviation", unit="m", clip=(0.0, 10.0), weight=1.0, spread=0.97)
 def lane_deviation(motion: Motion) -> Tensor:
     """Distance in the plane of the agent's centre from the nearest centre line of a lane of any kind."""
     return motion_on_lanes(motion, "lane_deviation")[0]
 
 
-@register("heading_error", unit="rad", clip=(0.0, math.pi), weight=1.0, spread=1.0)
+@register("heading_error", unit="rad", clip=(0.0, math.pi), weight=1.0, spread=0.46)
 def heading_error(motion: Motion) -> Tensor:
     """Angle between the agent's heading and the direction of the nearest lane.
 
@@ -48,7 +48,7 @@ def heading_error(motion: Motion) -> Tensor:
     return wrap_angle(motion.ego_poses()[..., 3] - direction).abs()
 
 
-@register("time_to_collision", unit="s", clip=(0.0, LONGEST_TIME), weight=1.0, spread=1.0, past=1)
+@register("time_to_collision", unit="s", clip=(0.0, LONGEST_TIME), weight=1.0, spread=0.55, past=1)
 def time_to_collision_(motion: Motion) -> Tensor:
     """Time until the agent reaches its leader at present speeds, cut at 5 s (SPEC section 3.2).
 

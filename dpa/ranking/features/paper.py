@@ -10,13 +10,13 @@ from envs.geometry.edges import RoadEdges
 from envs.scene import EDGE_KINDS, STEP_SECONDS, polylines
 
 
-@register("collision", unit="1", clip=(0.0, 1.0), weight=10.0, spread=1.0)
+@register("collision", unit="1", clip=(0.0, 1.0), weight=10.0, spread=0.21)
 def collision(motion: Motion) -> Tensor:
     """1 while the agent's box, corners rounded, overlaps another one."""
     return (motion.clearance < 0).float()
 
 
-@register("road_edge", unit="m", clip=(-20.0, 40.0), weight=5.0, spread=1.0)
+@register("road_edge", unit="m", clip=(-20.0, 40.0), weight=5.0, spread=1.7)
 def road_edge(motion: Motion) -> Tensor:
     """Signed distance to the road edge of the corner farthest out; positive off the road."""
     poses, extent = motion.ego_poses(), motion.extent[motion.ego][:, None].expand(*motion.shape[1:], 3)
@@ -28,20 +28,20 @@ def road_edge(motion: Motion) -> Tensor:
     return distance
 
 
-@register("clearance", unit="m", clip=(-5.0, 40.0), weight=2.0, spread=1.0)
+@register("clearance", unit="m", clip=(-5.0, 40.0), weight=2.0, spread=3.2)
 def clearance(motion: Motion) -> Tensor:
     """Signed distance to the nearest other agent; negative in a collision."""
     return motion.clearance
 
 
-@register("effort", unit="m/s^2", clip=(0.0, 12.0), weight=1.0, spread=1.0, past=2)
+@register("effort", unit="m/s^2", clip=(0.0, 12.0), weight=1.0, spread=2.1, past=2)
 def effort(motion: Motion) -> Tensor:
     """Norm of the acceleration vector from the last three positions."""
     now, before, first = (motion.ego_poses(back)[..., :2] for back in range(3))
     return torch.linalg.vector_norm(now - 2 * before + first, dim=-1) / STEP_SECONDS**2
 
 
-@register("speed", unit="m/s", clip=(0.0, 25.0), weight=1.0, spread=1.0, past=1)
+@register("speed", unit="m/s", clip=(0.0, 25.0), weight=1.0, spread=1.7, past=1)
 def speed(motion: Motion) -> Tensor:
     """Norm of the velocity from the last two positions."""
     now, before = (motion.ego_poses(back)[..., :2] for back in range(2))

@@ -1,0 +1,135 @@
+"""How far each feature of rollouts lies from that of the log, and what share of the cost follows (METHOD section 3).
+
+    python -m recipes.collect policy=runs/pretrain/policy.pt
+    python -m recipes.spread policy=runs/pretrain/policy.pt preferences=runs/preferences
+
+The spread of a feature is the root mean square of the difference between rollouts and log at the same step, both
+clipped, over all valid agent-steps. It goes into the feature's decorator, and ``weights="normalised"`` divides by it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import hydra
+import torch
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from dpa.policy import ContextOptions, MotionLM, make_context
+from dpa.preferences import PreferenceStore
+from dpa.ranking.features import FEATURES, feature_names, feature_weights, log_trajectory, occupancy_features
+from dpa.rollout import lifted
+from envs.progress import progress
+from envs.scene import Scene, SceneSource
+from recipes.cli import CONFIG, recipe, write_json
+from recipes.models import open_policy, weights_digest
+from recipes.scenes import fingerprint, open_splits
+
+
+class Spread(NamedTuple):
+    """Of one feature.
+
+    Attributes:
+        feature: its name.
+        spread: root mean square of the difference between rollouts and log at the same step [the feature's unit].
+        paper: share in the squared cost of steps coupled with themselves, with the paper's weights.
+        normalised: the same with the normalised weights that are registered.
+    """
+
+    feature: str
+    spread: float
+    paper: float
+    normalised: float
+
+
+def spreads(rollouts: Iterator[tuple[Scene, Tensor]], names: Sequence[str]) -> list[Spread]:
+    """Measure the spread of some features.
+
+    Args:
+        rollouts: scenes, each with its rollouts ``[K, A, T, 4]``.
+        names: of the features.
+
+    Raises:
+        ValueError: no agent-step of any log is valid.
+
+    Examples:
+        >>> from envs.sources.synthetic import straight_road
+        >>> scene = straight_road(1, speed=10.0)
+        >>> log = log_trajectory(scene, 80)
+        >>> faster = log + torch.arange(1, 81)[:, None] * torch.tensor([0.2, 0, 0, 0])
+        >>> spreads(iter([(scene, faster[None])]), ["speed"])[0].spread
+        2.0
+    """
+    total, count = torch.zeros(len(names), dtype=torch.float64), 0
+    for scene, poses in rollouts:
+        both = torch.cat((poses, log_trajectory(scene, poses.shape[2])[None]))
+        phi, valid = occupancy_features(scene, both, names)
+        total += (phi[:-1] - phi[-1:]).double().square().sum((0, 1, 2))
+        count += len(poses) * int(valid.sum())
+    if not count:
+        raise ValueError("no agent-step of these scenes has a valid log, so there is nothing to measure; take others.")
+    square = total / count
+    paper, normalised = (
+        share / share.sum() for share in (feature_weights(names, weights) * square for weights in (None, "normalised"))
+    )
+    columns = (square.sqrt().tolist(), paper.tolist(), normalised.tolist())
+    return [Spread(*row) for row in zip(names, *columns, strict=True)]
+
+
+def stored_rollouts(
+    store: PreferenceStore, scenes: SceneSource, model: MotionLM, options: ContextOptions
+) -> Iterator[tuple[Scene, Tensor]]:
+    """Scenes of a preference store with its rollouts ``[K, A, T, 4]``: their poses follow from their tokens."""
+    for row, index in enumerate(progress(store.scenes.tolist(), "spread", unit="scene")):
+        scene = scenes[index]
+        context = make_context(scene, options)
+        tokens = store.read([row], num_agents=len(context.kind))["tokens"][0]
+        recent, kind = (value.expand(len(tokens), *value.shape) for value in (context.recent, context.kind))
+        yield scene, lifted(scene, model.tokenizer.decode_tracks(tokens, recent, kind))
+
+
+def check_provenance(store: PreferenceStore, model: MotionLM, scenes: SceneSource) -> None:
+    """Refuse rollouts of another policy or of other scenes, whose tokens would mean nothing here.
+
+    Raises:
+        ValueError: they are.
+    """
+    for what, stored, here in (
+        ("policy", store.provenance.policy, weights_digest(model)),
+        ("scenes", store.provenance.scenes, fingerprint(scenes)),
+    ):
+        if stored != here:
+            raise ValueError(
+                f"the rollouts of preferences={store.folder} have another {what} ({stored}, here {here}); name those "
+                f"of this {what}, or collect them."
+            )
+
+
+@hydra.main(**CONFIG, config_name="spread")
+@recipe
+def main(cfg: DictConfig) -> None:
+    """Entry point of ``python -m recipes.spread``."""
+    names = feature_names(cfg.features if isinstance(cfg.features, str) else list(cfg.features))
+    scenes = open_splits(cfg.scenes)[cfg.split]
+    model, options, _ = open_policy(cfg.policy)
+    store = PreferenceStore(cfg.preferences)
+    check_provenance(store, model, scenes)
+    rows = spreads(stored_rollouts(store, scenes, model, options), names)
+    table = Table(title=f"{len(store)} scenes, {store.provenance.num_rollouts} rollouts each", title_justify="left")
+    for title in ("feature", "unit", "weight", "spread", "share, paper", "share, normalised"):
+        table.add_column(title, justify="left" if title in ("feature", "unit") else "right")
+    for row in rows:
+        feature = FEATURES[row.feature]
+        numbers = (f"{row.spread:.3g}", f"{row.paper:.1%}", f"{row.normalised:.1%}")
+        table.add_row(row.feature, feature.unit, f"{feature.weight:g}", *numbers)
+    Console(width=100).print(table)
+    if cfg.json is not None:
+        write_json(cfg.json, [row._asdict() for row in rows])
+
+
+if __name__ == "__main__":
+    main()
