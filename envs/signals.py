@@ -208,6 +208,7 @@ class Signals:
     """
 
     def __init__(self, names: Sequence[str], num_rollouts: int, device: torch.device) -> None:
+        names = [names] if isinstance(names, str) else names
         unknown = [name for name in names if name not in SIGNALS]
         if unknown or len(set(names)) < len(names):
             raise ValueError(f"signals must be different names of {sorted(SIGNALS)}, got {list(names)}.")

@@ -31,6 +31,7 @@ class Manifest:
     Attributes:
         source: name of the source that the scenes came from.
         options: how they were converted.
+        named: what the user named as inputs; a moved file changes nothing.
         plan: digest of the inputs and their order; a conversion goes on only with its own plan.
         complete: every shard is there.
         shards: ``name``, number of ``scenes`` and ``sha256`` of the file of each shard, in order.
@@ -41,6 +42,7 @@ class Manifest:
     source: str
     options: dict[str, Any]
     plan: str
+    named: list[str] = field(default_factory=list)
     complete: bool = False
     shards: list[dict[str, Any]] = field(default_factory=list)
     skipped: list[dict[str, Any]] = field(default_factory=list)
@@ -51,6 +53,7 @@ _MANIFEST_SHAPE = {
     "source": str,
     "options": {str: object},
     "plan": str,
+    "named": [str],
     "complete": bool,
     "shards": [{"name": str, "scenes": int, "sha256": str}],
     "skipped": [{"input": str, "record": int, "error": str}],
@@ -113,6 +116,10 @@ class SceneStore:
         if not folders:
             raise SceneError("a store needs a folder; give one that `python -m envs.convert` has written.")
         self.folders = tuple(Path(folder).absolute() for folder in folders)
+        for folder in self.folders:
+            if not (folder / MANIFEST_FILE).is_file():
+                what = "has no manifest.json, so it is no store of scenes" if folder.exists() else "does not exist"
+                raise SceneError(f"{folder} {what}; name a folder that `python -m envs.convert` has written.")
         self.manifests = tuple(read_manifest(folder) for folder in self.folders)
         self._shards: list[Shard] = []
         self._owner: list[int] = []

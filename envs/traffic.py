@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from numbers import Integral
+from os import PathLike
 from typing import Literal
 
 import torch
@@ -98,6 +99,8 @@ class TrafficEnv(EnvBase):
         order: Literal["sequential", "random"] = "sequential",
         device: torch.device | str = "cpu",
     ) -> None:
+        if isinstance(scenes, str | PathLike):
+            raise TypeError(f"TrafficEnv takes scenes, got {scenes!r}; open a folder with SceneStore({str(scenes)!r}).")
         if len(scenes) == 0:
             raise ValueError("TrafficEnv needs at least one scene, got an empty source.")
         if order not in ("sequential", "random"):

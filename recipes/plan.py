@@ -70,6 +70,17 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def check_positive(options: argparse.Namespace) -> None:
+    """Refuse numbers of which no plan can be made.
+
+    Raises:
+        ValueError: the first one that is not positive, by the name of its option.
+    """
+    for name, value in vars(options).items():
+        if isinstance(value, int | float) and not value > 0:
+            raise ValueError(f"--{name.replace('_', '-')} must be positive, got {value}.")
+
+
 def make_plan(rates: dict[str, float], memory: dict[str, float], options: argparse.Namespace) -> list[Part]:
     """The parts of the method.
 
@@ -127,6 +138,10 @@ def read_rates(path: Path) -> tuple[dict[str, float], dict[str, float], dict[str
         rates = {row["how"]: float(row["agent_steps_per_second"]) for row in rows}
         memory = {row["how"]: float(row["gib"]) for row in rows}
         missing = {"ranked", "collector", "trained"} - rates.keys()
+    except FileNotFoundError as error:
+        raise ValueError(
+            f"{path} does not exist; write it with `python -m recipes.benchmark rollout --json`."
+        ) from error
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path} is no JSON of `python -m recipes.benchmark rollout` ({error!r}).") from error
     if missing:
@@ -138,6 +153,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; returns the exit status."""
     options = make_parser().parse_args(arguments)
     try:
+        check_positive(options)
         rates, memory, measured = read_rates(options.rollout)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

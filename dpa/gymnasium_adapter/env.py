@@ -96,6 +96,8 @@ class TrafficGym(gymnasium.Env[Observation, Any]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}.")
         _check_events(terminate_on)
+        if unknown := sorted(set(weights) - set(SIGNALS)):
+            raise ValueError(f"weights must be of the signals {', '.join(sorted(SIGNALS))}, got {', '.join(unknown)}.")
         self.tokenizer, self.sight = tokenizer or VerletTokenizer(), sight or Sight()
         self.weights, self.terminate_on = dict(weights), tuple(terminate_on)
         self.render_mode = render_mode

@@ -215,6 +215,8 @@ def make_collector(
         ([0, 0, 0, 0], torch.Size([4, 16, 2]))
         ([1, 1, 1, 1], torch.Size([4, 16, 9]))
     """
+    if num_rollouts < 1:
+        raise ValueError(f"num_rollouts must be 1 or more, got {num_rollouts}.")
     options = options or ContextOptions()
     job = RolloutJob(
         scenes,

@@ -46,7 +46,9 @@ class Workers:
         if self.backend not in ("local", "process", "ray"):
             raise ValueError(f"backend must be local, process or ray, got {self.backend!r}.")
         if self.count < 1 or self.threads < 1:
-            raise ValueError(f"count and threads must be 1 or more, got {self.count} and {self.threads}.")
+            raise ValueError(
+                f"count and threads of workers must be 1 or more, got count={self.count} and threads={self.threads}."
+            )
         if self.backend == "local" and self.count > 1:
             raise ValueError(f"{self.count} workers need backend=process or backend=ray, got backend=local.")
 

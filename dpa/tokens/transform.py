@@ -35,7 +35,13 @@ class TokenAction(Transform):
         self.tokenizer = tokenizer
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = self.tokenizer.decode(tensordict[keys.TOKEN], tensordict[keys.RECENT], tensordict[keys.KIND])
+        token = tensordict[keys.TOKEN]
+        # A token outside the vocabulary would be decoded to a motion that none has.
+        if not bool(((token >= 0) & (token < self.tokenizer.vocab_size)).all()):
+            raise ValueError(
+                f"tokens must be 0 to {self.tokenizer.vocab_size - 1}, got {int(token.min())} to {int(token.max())}."
+            )
+        action = self.tokenizer.decode(token, tensordict[keys.RECENT], tensordict[keys.KIND])
         return tensordict.set(keys.ACTION, action)
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:

@@ -351,7 +351,9 @@ def _read(path: Path, kind: str) -> dict[str, Any]:
     except CheckpointError:
         raise
     except Exception as error:
-        raise CheckpointError(f"{path} is no whole checkpoint ({type(error).__name__}).") from error
+        raise CheckpointError(
+            f"{path} is no whole checkpoint ({type(error).__name__}); name a file that training has written."
+        ) from error
     if not isinstance(payload, dict) or payload.get("format") != FORMAT:
         raise CheckpointError(f"{path} was not written by this version of the project ({FORMAT}).")
     if payload["kind"] != kind:

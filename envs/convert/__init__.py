@@ -85,7 +85,7 @@ def convert(
         SOURCES[source], list(map(str, paths)), out, shard_size=shard_size, limit=limit, skip_bad=skip_bad
     )
     options = {"shard_size": shard_size, "limit": limit, "split": split}
-    manifest = Manifest(source, options, digest(tasks))
+    manifest = Manifest(source, options, digest(tasks), list(map(str, paths)))
     out.mkdir(parents=True, exist_ok=True)
     with _locked(out):
         if not _resume(out, manifest):

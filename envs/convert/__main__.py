@@ -61,6 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if command == "verify":
             with progress(total=len(store), description="verify", unit="scene") as bar:
                 store.verify(bar.update)
+            sys.stdout.write(f"verified: {len(store)} scenes, every checksum and every value is right\n")
         sys.stdout.write(describe(store) + "\n")
         if ids:
             rows = zip(store.scene_ids, store.num_agents.tolist(), strict=True)

@@ -29,6 +29,7 @@ def write_card(folder: Path, manifest: Manifest) -> None:
         "split": manifest.options["split"] or "(no name)",
         "shards": f"{len(manifest.shards)} of up to {manifest.options['shard_size']} scenes",
         "size": f"{size / 1e6:.1f} MB, {size / 1e3 / card.counts['scenes']['all']:.0f} KB for a scene",
+        "made of": ", ".join(manifest.named) or "(not noted)",
         "plan": manifest.plan,
     }
     errors = [skip["error"] for skip in manifest.skipped]
@@ -41,9 +42,11 @@ def describe(store: SceneStore) -> str:
     """What a store of one folder holds, as text of a few lines."""
     (folder,), (manifest,) = store.folders, store.manifests
     size = sum((folder / shard["name"]).stat().st_size for shard in manifest.shards)
+    options = ", ".join(f"{name} {value}" for name, value in manifest.options.items() if value not in ("", None))
     lines = [
         f"{folder}",
-        f"  source    {manifest.source}, {manifest.options}",
+        f"  source    {manifest.source}: {', '.join(manifest.named) or 'not noted'}",
+        f"  options   {options}",
         f"  scenes    {len(store)} in {len(manifest.shards)} shards, {store.has_lights.sum()} with traffic lights",
         f"  agents    {store.num_agents.mean():.1f} in a scene at the current step, {store.num_agents.max()} at most",
         f"  size      {size / 1e6:.1f} MB, {size / 1e3 / len(store):.0f} KB per scene",

@@ -129,7 +129,14 @@ def add_options(part: argparse.ArgumentParser) -> None:
 
 
 def measure(options: dict[str, Any]) -> list[dict[str, Any]]:
-    """Run the part and print its tables."""
+    """Run the part and print its tables.
+
+    Raises:
+        ValueError: a number below 1.
+    """
+    for name in ("agents", "rollouts", "scenes", "threads", "repeats"):
+        if options[name] < 1:
+            raise ValueError(f"--{name} must be 1 or more, got {options[name]}.")
     main = Case("incremental", **{key: value for key, value in options.items() if key not in ("sweep", "compile")})
     kinds = ("incremental", "collector", "naive", "uncached", "ranked", *(("compiled",) if options["compile"] else ()))
     cases = [replace(main, how=how) for how in kinds]

@@ -192,7 +192,7 @@ def test_a_store_is_given_by_its_folder(tmp_path: Path, write_store: Callable[..
         ({"control": "predict"}, "control must be 'sdc' or 'all', got 'predict'"),
         ({"render_mode": "human"}, "render_mode must be None or 'rgb_array', got 'human'"),
         ({"terminate_on": ("progress",)}, r"terminate_on must name events of .*, got \['progress'\]"),
-        ({"weights": {"speed": 1.0}}, "signals must be different names of .*'speed'"),
+        ({"weights": {"speed": 1.0}}, "weights must be of the signals .*, got speed"),
         ({"scenes": []}, "at least one scene"),
         ({"horizon": 17}, r"at most 80 steps of 0.1 s, got 17 \* 5"),
     ],

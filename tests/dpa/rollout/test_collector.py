@@ -178,7 +178,10 @@ def test_an_error_in_a_worker_is_raised_where_the_batch_is_asked_for(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"count": 0, "backend": "process"}, "count and threads must be 1 or more, got 0 and 1"),
+        (
+            {"count": 0, "backend": "process"},
+            "count and threads of workers must be 1 or more, got count=0 and threads=1",
+        ),
         ({"count": 2}, "2 workers need backend=process or backend=ray, got backend=local"),
         ({"backend": "threads"}, "backend must be local, process or ray, got 'threads'"),
     ],
