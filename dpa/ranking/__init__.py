@@ -5,23 +5,26 @@
 """
 
 from dpa.ranking.displacement import Displacement, average_displacement, final_displacement
-from dpa.ranking.distance import AGGREGATES, PreferenceDistance, Ranking, rank_of
+from dpa.ranking.distance import AGGREGATES, Distance, PreferenceDistance, Ranking, rank_of
 from dpa.ranking.features import FEATURE_SETS, FEATURES, Feature, Motion, log_trajectory, occupancy_features, register
-from dpa.ranking.transport import SOLVERS, Transport, feature_shares, transport_cost
+from dpa.ranking.transport import SOLVERS, Dense, Pairs, Problems, Transport, transport_cost
 
 __all__ = [
     "AGGREGATES",
     "FEATURES",
     "FEATURE_SETS",
     "SOLVERS",
+    "Dense",
     "Displacement",
+    "Distance",
     "Feature",
     "Motion",
+    "Pairs",
     "PreferenceDistance",
+    "Problems",
     "Ranking",
     "Transport",
     "average_displacement",
-    "feature_shares",
     "final_displacement",
     "log_trajectory",
     "occupancy_features",

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple, Protocol
 
 import torch
 from scipy.stats import rankdata
@@ -12,24 +12,26 @@ from torch import Tensor
 
 from dpa.ranking.displacement import average_displacement
 from dpa.ranking.features import feature_clips, feature_names, feature_weights, log_trajectory, occupancy_features
-from dpa.ranking.transport import SOLVERS, feature_shares, transport_cost
-from envs.scene import CURRENT_STEP, Scene
+from dpa.ranking.transport import deciding_options, make_solver, transport_cost
+from envs.scene import CURRENT_STEP, STEP_SECONDS, Scene
 
 AGGREGATES: dict[str, Callable[[Tensor], Tensor]] = {
     "sum": lambda distance: distance.sum(-1),
     "mean": lambda distance: distance.mean(-1),
+    "median": lambda distance: distance.quantile(0.5, dim=-1),
     "max": lambda distance: distance.amax(-1),
     "mean_rank": lambda distance: torch.from_numpy(rankdata(distance.cpu().numpy(), axis=0)).float().mean(-1),
 }
 """From the ranked agents' distances ``[R, E]`` to the scene's ``[R]``.
 
-The paper sums. One agent often carries most of a sum; ``mean_rank`` gives each agent the same say: the mean over agents
-of the rollout's rank in the eyes of that agent, 1 for the nearest.
+The paper sums. One agent often carries most of a sum; ``median`` leaves such an agent no more than its place in the
+order, and ``mean_rank`` gives each agent the same say: the mean over agents of the rollout's rank in the eyes of that
+agent, 1 for the nearest.
 """
 
 
 class Ranking(NamedTuple):
-    """R rollouts of one scene against its log; A are the agents present at the current step."""
+    """R rollouts of one scene against its log; A are the agents present at the current step, D features."""
 
     distance: Tensor
     """``[R]``: agents aggregated; 0 where no agent is ranked."""
@@ -39,6 +41,27 @@ class Ranking(NamedTuple):
     """``[R]``: mean displacement from the log over the ranked agents [m]."""
     agent_ranked: Tensor
     """``[A]`` bool."""
+    feature_share: Tensor
+    """``[R, D]``: share of each feature in the summed distance of the ranked agents, whatever the aggregate; rows sum
+    to 1, or are 0 where that distance is 0. It tells which feature decides: units and clip ranges do more than weights.
+    """
+
+
+class Distance(Protocol):
+    """How rollouts of a scene are compared with its log: :class:`PreferenceDistance`, or a function of your own."""
+
+    def __call__(self, scene: Scene, trajectories: Tensor, controlled: Tensor, /) -> Ranking:
+        """Rank rollouts of one scene.
+
+        Args:
+            scene: an uncollated scene.
+            trajectories: ``[R, A, T, 4]`` x, y, z, heading at 10 Hz after the current step, of the present agents in
+                order.
+            controlled: ``[A]`` bool.
+
+        Returns:
+            the ranking; D is the same for all scenes and may be 0.
+        """
 
 
 def rank_of(distance: Tensor) -> Tensor:
@@ -63,13 +86,14 @@ class PreferenceDistance:
 
     Args:
         features: a set of :data:`~dpa.ranking.features.FEATURE_SETS`, or names of features.
-        weights: weights that differ from the paper's, by feature.
+        weights: the name of a set of weights, or weights that differ from the paper's, by feature.
         clips: clip ranges that differ from the registered ones, by feature.
         stride: measure every ``stride``-th step of 0.1 s.
         method: a key of :data:`~dpa.ranking.transport.SOLVERS`.
+        solver: options of the method: ``window`` [s], or those of :class:`~dpa.ranking.transport.sinkhorn.Sinkhorn`.
         aggregate: a key of :data:`AGGREGATES`.
         agents: rank all ``"controlled"`` agents, or of these only the ``"evaluated"`` ones.
-        threads: transport problems solved at the same time; changes no result.
+        threads: blocks of transport problems solved at the same time; changes no result.
 
     Raises:
         ValueError: an unknown name among the options; the message lists the known ones.
@@ -87,10 +111,11 @@ class PreferenceDistance:
     """
 
     features: str | Sequence[str] = "full"
-    weights: Mapping[str, float] | None = None
+    weights: str | Mapping[str, float] | None = None
     clips: Mapping[str, tuple[float, float]] | None = None
     stride: int = 1
     method: str = "exact"
+    solver: Mapping[str, Any] = field(default_factory=dict)
     aggregate: str = "sum"
     agents: Literal["controlled", "evaluated"] = "controlled"
     threads: int = 1
@@ -99,17 +124,23 @@ class PreferenceDistance:
         names = feature_names(self.features)
         feature_weights(names, self.weights)
         feature_clips(names, self.clips)
-        for option, known in (("method", SOLVERS), ("aggregate", AGGREGATES), ("agents", ("controlled", "evaluated"))):
+        make_solver(self.method, **self.solver)
+        for option, known in (("aggregate", AGGREGATES), ("agents", ("controlled", "evaluated"))):
             if getattr(self, option) not in known:
                 raise ValueError(f"unknown {option} {getattr(self, option)!r}; choose one of {sorted(known)}.")
 
     def describe(self) -> dict[str, Any]:
         """The options that decide a ranking, with defaults filled in, ready for JSON."""
         names = feature_names(self.features)
-        options = {k: v for k, v in asdict(self).items() if k not in ("features", "weights", "clips", "threads")}
-        weights = dict(zip(names, feature_weights(names, self.weights).tolist(), strict=True))
-        clips = {name: list(clip) for name, clip in feature_clips(names, self.clips).items()}
-        return {"weights": weights, "clips": clips, **options}
+        return {
+            "weights": dict(zip(names, feature_weights(names, self.weights).tolist(), strict=True)),
+            "clips": {name: list(clip) for name, clip in feature_clips(names, self.clips).items()},
+            "stride": self.stride,
+            "method": self.method,
+            "solver": deciding_options(make_solver(self.method, **self.solver)),
+            "aggregate": self.aggregate,
+            "agents": self.agents,
+        }
 
     def __call__(self, scene: Scene, trajectories: Tensor, controlled: Tensor | None = None) -> Ranking:
         """Rank rollouts of one scene.
@@ -122,7 +153,18 @@ class PreferenceDistance:
         """
         ego = self._ego(scene, controlled)
         phi, log_phi, valid = self._features(scene, trajectories, ego)
-        moved = transport_cost(phi, log_phi, valid, valid, self._weights(), method=self.method, threads=self.threads)
+        weights = feature_weights(feature_names(self.features), self.weights)
+        moved = transport_cost(
+            phi,
+            log_phi,
+            valid,
+            valid,
+            weights,
+            method=self.method,
+            threads=self.threads,
+            step=self.stride * STEP_SECONDS,
+            **self.solver,
+        )
 
         ego = ego[valid.any(-1)]
         agent_distance = trajectories.new_zeros(trajectories.shape[:2])
@@ -131,18 +173,12 @@ class PreferenceDistance:
         agent_ranked[ego] = True
         if len(ego) == 0:
             nothing = trajectories.new_zeros(len(trajectories))
-            return Ranking(nothing, agent_distance, nothing, agent_ranked)
+            return Ranking(nothing, agent_distance, nothing, agent_ranked, _shares(moved.parts))
         steps = trajectories.shape[2]
         log_valid = scene.agents.valid[scene.agents.present][ego, CURRENT_STEP + 1 : CURRENT_STEP + 1 + steps]
         ade = average_displacement(trajectories[:, ego], log_trajectory(scene, steps)[ego], log_valid).scene
-        return Ranking(AGGREGATES[self.aggregate](agent_distance[:, ego]), agent_distance, ade, agent_ranked)
-
-    def shares(self, scene: Scene, trajectories: Tensor, controlled: Tensor | None = None) -> dict[str, float]:
-        """Share of each feature in the squared cost that the rollouts pay (arguments of :meth:`__call__`)."""
-        phi, log_phi, valid = self._features(scene, trajectories, self._ego(scene, controlled))
-        moved = transport_cost(phi, log_phi, valid, valid, self._weights(), method=self.method, coupling=True)
-        shares = feature_shares(phi, log_phi, moved.coupling, self._weights())
-        return dict(zip(feature_names(self.features), shares.tolist(), strict=True))
+        distance = AGGREGATES[self.aggregate](agent_distance[:, ego])
+        return Ranking(distance, agent_distance, ade, agent_ranked, _shares(moved.parts))
 
     def _ego(self, scene: Scene, controlled: Tensor | None) -> Tensor:
         """``[E]`` int64: rows of the agents that may be ranked."""
@@ -158,5 +194,9 @@ class PreferenceDistance:
         phi, valid = occupancy_features(scene, both, self.features, ego=ego, stride=self.stride, clips=self.clips)
         return phi[:-1], phi[-1:], valid
 
-    def _weights(self) -> Tensor:
-        return feature_weights(feature_names(self.features), self.weights)
+
+def _shares(parts: Tensor) -> Tensor:
+    """``[R, D]`` of the agents' parts ``[R, E, D]``."""
+    paid = parts.sum(1)
+    total = paid.sum(-1, keepdim=True)
+    return torch.where(total > 0, paid / total, 0)

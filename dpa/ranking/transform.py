@@ -7,7 +7,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Transform
 
-from dpa.ranking.distance import PreferenceDistance, Ranking, rank_of
+from dpa.ranking.distance import Distance, PreferenceDistance, Ranking, rank_of
 from envs import keys
 from envs.geometry.ground import lift
 from envs.scene import CURRENT_STEP, Scene, SceneSource
@@ -25,13 +25,13 @@ class RankRollouts(Transform):
 
     Reads ``scene`` and ``step`` ``[B, T]``, and under ``agents`` ``token`` and ``controlled`` ``[B, T, A]`` and
     ``("next", ..., "recent")`` ``[B, T, A, F + 1, 3]``. Writes a tensordict of batch size ``[S]`` with the keys of
-    :mod:`envs.keys` from ``TOKENS`` to ``RANK`` (of the preference distance), and ``SCENE``. Agents are the rows of the
+    :mod:`envs.keys` from ``TOKENS`` to ``RANK`` (of the distance), and ``SCENE``. Agents are the rows of the
     environment: those present in the scene, in order, then padding.
 
     Args:
         scenes: where the environment's scenes come from.
         num_rollouts: K.
-        distance: how rollouts are compared; the paper's way by default.
+        distance: how rollouts are compared; the paper's way by default. Any :class:`~dpa.ranking.distance.Distance`.
 
     Raises:
         ValueError: in ``forward``, when the batch is not made of whole groups of whole episodes.
@@ -47,7 +47,7 @@ class RankRollouts(Transform):
         torch.Size([2, 4])
     """
 
-    def __init__(self, scenes: SceneSource, num_rollouts: int, distance: PreferenceDistance = PAPER_DISTANCE) -> None:
+    def __init__(self, scenes: SceneSource, num_rollouts: int, distance: Distance = PAPER_DISTANCE) -> None:
         super().__init__(
             in_keys=[keys.SCENE, keys.STEP, keys.TOKEN, keys.CONTROLLED, ("next", *keys.RECENT)],
             out_keys=[
@@ -58,6 +58,8 @@ class RankRollouts(Transform):
                 keys.AGENT_DISTANCE,
                 keys.ADE,
                 keys.AGENT_RANKED,
+                keys.AGENT_KIND,
+                keys.FEATURE_SHARE,
                 keys.RANK,
             ],
         )
@@ -68,7 +70,8 @@ class RankRollouts(Transform):
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Rank every group: ``[S * K, T]`` -> ``[S]``."""
         scene, controlled, tokens, poses = self._groups(tensordict)
-        rankings = [self._rank(*group) for group in zip(scene.tolist(), poses.cpu(), controlled.cpu(), strict=True)]
+        ranked = [self._rank(*group) for group in zip(scene.tolist(), poses.cpu(), controlled.cpu(), strict=True)]
+        rankings, kinds = zip(*ranked, strict=True)
         distance = torch.stack([ranking.distance for ranking in rankings])
         return TensorDict(
             {
@@ -79,6 +82,8 @@ class RankRollouts(Transform):
                 keys.AGENT_DISTANCE: torch.stack([ranking.agent_distance for ranking in rankings]),
                 keys.ADE: torch.stack([ranking.ade for ranking in rankings]),
                 keys.AGENT_RANKED: torch.stack([ranking.agent_ranked for ranking in rankings]),
+                keys.AGENT_KIND: torch.stack(kinds),
+                keys.FEATURE_SHARE: torch.stack([ranking.feature_share for ranking in rankings]),
                 keys.RANK: rank_of(distance),
             },
             batch_size=[len(rankings)],
@@ -122,18 +127,19 @@ class RankRollouts(Transform):
             )
         return one[:, 0, 0]
 
-    def _rank(self, index: int, poses: Tensor, controlled: Tensor) -> Ranking:
-        """Rank one group, agents padded as in the environment."""
+    def _rank(self, index: int, poses: Tensor, controlled: Tensor) -> tuple[Ranking, Tensor]:
+        """Rank one group, and the kinds ``[A]`` of its agents, padded as in the environment."""
         scene = self.scenes[index]
         num_agents = self._num_agents(scene, poses.shape[1])
         start = scene.agents.position[scene.agents.present, CURRENT_STEP]
         trajectories = lift(poses[:, :num_agents], start, scene.road.points)
         ranking = self.distance(scene, trajectories, controlled[:num_agents])
         padding = (0, poses.shape[1] - num_agents)
-        return ranking._replace(
+        padded = ranking._replace(
             agent_distance=torch.nn.functional.pad(ranking.agent_distance, padding),
             agent_ranked=torch.nn.functional.pad(ranking.agent_ranked, padding),
         )
+        return padded, torch.nn.functional.pad(scene.agents.kind[scene.agents.present], padding)
 
     @staticmethod
     def _num_agents(scene: Scene, rows: int) -> int:
