@@ -74,7 +74,7 @@ def deciding_options(solver: Solver) -> dict[str, Any]:
 
     Examples:
         >>> deciding_options(make_solver("sinkhorn", epsilon=0.1, compile=True))
-        {'epsilon': 0.1, 'start': 1.0, 'iterations': 1000, 'tolerance': 0.001}
+        {'epsilon': 0.1, 'start': 1.0, 'iterations': 1000, 'tolerance': 0.01}
     """
     return {field.name: getattr(solver, field.name) for field in dataclasses.fields(solver) if field.compare}
 
@@ -147,7 +147,7 @@ def transport_cost(
         if values[0] is None:
             return None
         value = torch.cat(values)
-        return value.reshape(*batch, *value.shape[1:]).to(torch.bool if value.dtype == torch.bool else x.dtype)
+        return value.reshape((*batch, *value.shape[1:])).to(torch.bool if value.dtype == torch.bool else x.dtype)
 
     return Transport(*map(together, zip(*solved, strict=True)))
 

@@ -97,7 +97,9 @@ def _solve(problems: Problems, reach: float | None) -> Pairs:
     def together(values: list[np.ndarray], dtype: type) -> torch.Tensor:
         return torch.from_numpy(np.concatenate(values or [np.zeros(0, dtype)])).to(device)
 
-    return Pairs(together(problem, np.int64), together(row, np.int64), together(column, np.int64), together(mass, float))
+    return Pairs(
+        together(problem, np.int64), together(row, np.int64), together(column, np.int64), together(mass, float)
+    )
 
 
 def _assign(cost: np.ndarray, far: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -113,6 +115,7 @@ def _transport(cost: np.ndarray, far: np.ndarray | None) -> tuple[np.ndarray, np
         cost = np.where(far, (sum(cost.shape) + 1) * (cost.max() + 1), cost)
     n, m = cost.shape
     plan = ot.emd(ot.unif(n), ot.unif(m), np.ascontiguousarray(cost), numItermax=SIMPLEX_STEPS)
+    plan = np.rint(plan * (n * m)) / (n * m)  # masses of a vertex; rounding left traces on other entries
     i, j = plan.nonzero()
     return i, j, plan[i, j]
 

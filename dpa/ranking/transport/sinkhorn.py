@@ -41,7 +41,7 @@ class Sinkhorn:
     epsilon: float = 0.02
     start: float | None = 1.0
     iterations: int = 1000
-    tolerance: float = 1e-3
+    tolerance: float = 1e-2
     compile: bool = field(default=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -50,6 +50,16 @@ class Sinkhorn:
                 raise ValueError(f"{name} of sinkhorn must be above 0, got {getattr(self, name)}.")
         if self.start is not None and not self.epsilon <= self.start < math.inf:
             raise ValueError(f"start of sinkhorn must be epsilon ({self.epsilon}) or more, got {self.start}.")
+        if self.iterations <= self.annealing:
+            raise ValueError(
+                f"iterations of sinkhorn must be more than the {self.annealing} that lead from start ({self.start}) to "
+                f"epsilon ({self.epsilon}), got {self.iterations}."
+            )
+
+    @property
+    def annealing(self) -> int:
+        """Iterations before ``epsilon`` is reached."""
+        return 0 if self.start is None else CHECK_EVERY * math.ceil(math.log2(self.start / self.epsilon))
 
     def __call__(self, problems: Problems) -> Dense:
         """Solve; see :class:`~dpa.ranking.transport.Solver`."""
@@ -59,10 +69,10 @@ class Sinkhorn:
         return Dense.cat([self._solve(some) for some in problems.split(count)])
 
     def _solve(self, problems: Problems) -> Dense:
-        iterate = _compiled() if self.compile else _iterate
+        update = _compiled() if self.compile else _update
         cost, a, b = problems.cost, problems.x_mass, problems.y_mass
-        there = (a.any(-1) & b.any(-1))[:, None]
-        log_a, log_b = (torch.where(there, mass, 1).log() for mass in (a, b))  # no mass at all would give NaN
+        there = a.any(-1) & b.any(-1)
+        log_a, log_b = (torch.where(there[:, None], mass, 1).log() for mass in (a, b))  # no mass would give NaN
         pairs = a[:, :, None] * b[:, None]
         mean = (pairs * cost).sum((1, 2), keepdim=True)
         cost = cost / torch.where(mean > 0, mean, 1)
@@ -70,34 +80,36 @@ class Sinkhorn:
         # u and v are potentials in units of epsilon; those of a problem that has converged stand still.
         epsilon = self.epsilon if self.start is None else self.start
         u, v = torch.zeros_like(a), torch.zeros_like(b)
-        done, error = ~there[:, 0], torch.zeros_like(a[:, 0])
+        done, error = ~there, torch.zeros_like(mean[:, 0, 0])
         for first in range(0, self.iterations, CHECK_EVERY):
-            new_u, new_v, new_error = iterate(cost, u, v, log_a, log_b, epsilon, min(CHECK_EVERY, self.iterations - first))
+            scaled, new_u, new_v = cost / epsilon, u, v
+            for _ in range(min(CHECK_EVERY, self.iterations - first)):
+                new_u, new_v = update(scaled, new_v, log_a, log_b)
             u, v = torch.where(done[:, None], u, new_u), torch.where(done[:, None], v, new_v)
-            error = torch.where(done, error, new_error)
             if epsilon > self.epsilon:
                 following = max(epsilon / 2, self.epsilon)
                 u, v, epsilon = u * (epsilon / following), v * (epsilon / following), following
                 continue
+            # The update of v has set the mass at y; what u would change next is wrong at x.
+            left = (a * (u - _potential(scaled, v, log_b, 2)).expm1().abs()).sum(-1)
+            error = torch.where(done, error, left)
             done = done | (error <= self.tolerance)
             if bool(done.all()):
                 break
-        plan = pairs * (u[:, :, None] + v[:, None] - cost / epsilon).exp()
-        return Dense(plan, error)
+        return Dense(pairs * (u[:, :, None] + v[:, None] - cost / epsilon).exp(), error)
 
 
-def _iterate(
-    cost: Tensor, u: Tensor, v: Tensor, log_a: Tensor, log_b: Tensor, epsilon: float, times: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Some updates of both potentials ``[N, T]`` and ``[N, T']``, and the marginal error ``[N]`` that is left on x."""
-    for _ in range(times):
-        u = -torch.logsumexp((v + log_b)[:, None] - cost / epsilon, 2)
-        v = -torch.logsumexp((u + log_a)[:, :, None] - cost / epsilon, 1)
-    # The update of v has set the mass at y; what u would change next is wrong at x.
-    following = -torch.logsumexp((v + log_b)[:, None] - cost / epsilon, 2)
-    return u, v, (log_a.exp() * ((u - following).exp() - 1).abs()).sum(-1)
+def _potential(scaled: Tensor, other: Tensor, log_mass: Tensor, dim: int) -> Tensor:
+    """The potential of one side that gives it its marginal, from that of the other side, along ``dim``."""
+    return -torch.logsumexp((other + log_mass).unsqueeze(3 - dim) - scaled, dim)
+
+
+def _update(scaled: Tensor, v: Tensor, log_a: Tensor, log_b: Tensor) -> tuple[Tensor, Tensor]:
+    """One iteration: both potentials, ``[N, T]`` and ``[N, T']``."""
+    u = _potential(scaled, v, log_b, 2)
+    return u, _potential(scaled, u, log_a, 1)
 
 
 @functools.cache
-def _compiled() -> Callable[..., tuple[Tensor, Tensor, Tensor]]:
-    return torch.compile(_iterate)
+def _compiled() -> Callable[..., tuple[Tensor, Tensor]]:
+    return torch.compile(_update)

@@ -108,13 +108,24 @@ def test_aggregates_of_a_hand_case() -> None:
     rollouts = log_trajectory(scene, 80).repeat(3, 1, 1, 1)
     rollouts[1, 0, :, 1] += 1.0
     rollouts[2, 1, :, 1] += 2.0
-    by = {name: PreferenceDistance(["road_edge"], aggregate=name)(scene, rollouts) for name in ("sum", "mean", "max")}
+    names = ("sum", "mean", "median", "max")
+    by = {name: PreferenceDistance(["road_edge"], aggregate=name)(scene, rollouts) for name in names}
     per_agent = by["sum"].agent_distance
     torch.testing.assert_close(by["sum"].distance, per_agent.sum(-1))
     torch.testing.assert_close(by["mean"].distance, per_agent.mean(-1))
     torch.testing.assert_close(by["max"].distance, per_agent.amax(-1))
+    torch.testing.assert_close(by["median"].distance, per_agent.mean(-1))  # of two
     mean_rank = PreferenceDistance(["road_edge"], aggregate="mean_rank")(scene, rollouts)
     assert mean_rank.distance.tolist() == [1.5, 2.25, 2.25]
+
+
+def test_the_median_does_not_follow_one_agent() -> None:
+    scene = straight_road(3)
+    rollouts = log_trajectory(scene, 80).repeat(2, 1, 1, 1)
+    rollouts[:, 1:, :, 1] += 0.5
+    rollouts[1, 0, :, 1] += 30.0
+    distance = PreferenceDistance(["road_edge"], aggregate="median")(scene, rollouts).distance
+    assert 0 < distance[1] <= 2 * distance[0]
 
 
 def test_a_coarser_stride_ranks_alike() -> None:
@@ -124,13 +135,38 @@ def test_a_coarser_stride_ranks_alike() -> None:
     assert torch.equal(rank_of(fine), rank_of(coarse))
 
 
-def test_shares_sum_to_one_and_a_weight_of_zero_takes_a_feature_out() -> None:
+def test_feature_shares_sum_to_one_and_a_weight_of_zero_takes_a_feature_out() -> None:
+    scene = scene_with_holes()
+    rollouts = torch.cat((shaken(scene, 2), log_trajectory(scene, 80)[None]))
+    shares = PreferenceDistance()(scene, rollouts).feature_share
+    torch.testing.assert_close(shares.sum(-1), torch.tensor([1.0, 1.0, 0.0]))
+    without = PreferenceDistance(weights={"effort": 0.0})(scene, rollouts).feature_share
+    assert (shares[:2, 3] > 0).all() and not without[:, 3].any()
+
+
+def test_a_feature_share_is_its_part_of_the_distances_of_all_ranked_agents() -> None:
     scene = straight_road(3)
     rollouts = shaken(scene, 2)
-    shares = PreferenceDistance().shares(scene, rollouts)
-    assert sum(shares.values()) == pytest.approx(1, abs=1e-5)
-    without = PreferenceDistance(weights={"effort": 0.0}).shares(scene, rollouts)
-    assert shares["effort"] > 0 == without["effort"]
+    rollouts[:, 1:] += torch.tensor([0, 0.5, 0, 0])
+    both = PreferenceDistance(["road_edge", "speed"], aggregate="max")(scene, rollouts)
+    controlled = torch.tensor([True, False, True])
+    some = PreferenceDistance(["road_edge", "speed"])(scene, rollouts, controlled)
+    last = PreferenceDistance(["road_edge", "speed"])(scene, rollouts, torch.tensor([False, True, False]))
+    summed = some.feature_share * some.distance[:, None] + last.feature_share * last.distance[:, None]
+    torch.testing.assert_close(both.feature_share, summed / both.agent_distance.sum(-1, keepdim=True))
+
+
+def test_a_window_is_in_seconds_whatever_the_stride() -> None:
+    scene = straight_road(2)
+    rollouts = shaken(scene, 2)
+    for stride, apart in ((1, 0.05), (5, 0.4)):
+        aligned = PreferenceDistance(stride=stride, method="time_aligned")(scene, rollouts)
+        windowed = PreferenceDistance(stride=stride, method="windowed", solver={"window": apart})(scene, rollouts)
+        torch.testing.assert_close(windowed.distance, aligned.distance)
+    exact, wide = (PreferenceDistance(method=method)(scene, rollouts).distance for method in ("exact", "windowed"))
+    narrow = PreferenceDistance(method="windowed", solver={"window": 0.4})(scene, rollouts).distance
+    aligned = PreferenceDistance(method="time_aligned")(scene, rollouts).distance
+    assert (exact <= wide).all() and (wide < narrow).all() and (narrow < aligned).all()
 
 
 def test_options_are_described_for_json_and_threads_are_left_out() -> None:
@@ -140,17 +176,25 @@ def test_options_are_described_for_json_and_threads_are_left_out() -> None:
     assert described == PreferenceDistance(weights={"speed": 2.0}).describe()
 
 
+def test_all_options_of_a_solver_that_decide_are_described() -> None:
+    described = PreferenceDistance(method="sinkhorn", solver={"epsilon": 0.1, "compile": True}).describe()
+    assert described["solver"] == {"epsilon": 0.1, "start": 1.0, "iterations": 1000, "tolerance": 0.01}
+    assert PreferenceDistance(method="windowed").describe()["solver"] == {"window": 2.0}
+    assert PreferenceDistance().describe()["solver"] == {}
+
+
 @pytest.mark.parametrize(
     "options",
     [
         {"features": "all"},
         {"weights": {"jerk": 1.0}},
         {"clips": {"jerk": (0, 1)}},
-        {"method": "sinkhorn"},
-        {"aggregate": "median"},
+        {"method": "nearest"},
+        {"method": "windowed", "solver": {"reach": 3}},
+        {"aggregate": "mode"},
         {"agents": "vehicles"},
     ],
 )
 def test_unknown_options_are_refused_when_the_distance_is_made(options: dict) -> None:
-    with pytest.raises(ValueError, match=r"all|jerk|sinkhorn|median|vehicles"):
+    with pytest.raises(ValueError, match=r"all|jerk|nearest|reach|mode|vehicles"):
         PreferenceDistance(**options)

@@ -6,10 +6,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dpa.ranking import PreferenceDistance, log_trajectory
+from dpa.ranking import PreferenceDistance, Ranking, log_trajectory
 from dpa.ranking.transform import RankRollouts
 from envs import keys
-from envs.scene import CURRENT_STEP, Scene
+from envs.scene import CURRENT_STEP, AgentKind, Scene
 from envs.sources.synthetic import straight_road
 
 K, A, T, F = 3, 4, 16, 5
@@ -61,6 +61,28 @@ def test_groups_have_the_documented_shapes_and_the_log_ranks_first(scenes: list[
     torch.testing.assert_close(groups[keys.ADE], torch.tensor([[0.5, 0, 0.5]] * 2), atol=1e-4, rtol=0)
     assert groups[keys.AGENT_RANKED].tolist() == [[True, True, False, False], [True, True, True, False]]
     assert torch.equal(groups[keys.TOKEN_VALID][..., 0], groups[keys.AGENT_RANKED])
+    share = groups[keys.FEATURE_SHARE]
+    assert share.shape == (2, K, 5)
+    torch.testing.assert_close(share.sum(-1), (groups[keys.DISTANCE] > 0).float())
+
+
+def test_the_kinds_of_the_agents_go_along(scenes: list[Scene]) -> None:
+    scenes[0].agents.kind[:] = torch.tensor([AgentKind.CYCLIST, AgentKind.OTHER, AgentKind.PEDESTRIAN, 1])  # 1 absent
+    groups = RankRollouts(scenes, K)(hand_made(scenes))
+    assert groups[keys.AGENT_KIND].tolist() == [[1, 1, 0, 0], [AgentKind.CYCLIST, AgentKind.PEDESTRIAN, 1, 0]]
+    assert groups[keys.AGENT_KIND].dtype == torch.int64
+
+
+def test_a_function_of_ones_own_ranks(scenes: list[Scene]) -> None:
+    def straying(scene: Scene, trajectories: torch.Tensor, controlled: torch.Tensor) -> Ranking:
+        """How far agents stray from their log sideways; it knows no features."""
+        agent = (trajectories - log_trajectory(scene, trajectories.shape[2]))[..., 1].abs().mean(-1)
+        distance = (agent * controlled).sum(-1)
+        return Ranking(distance, agent, distance, controlled, agent.new_zeros(len(agent), 0))
+
+    groups = RankRollouts(scenes, K, straying)(hand_made(scenes))
+    assert groups[keys.RANK].tolist() == [[1, 0, 2]] * 2
+    assert groups[keys.FEATURE_SHARE].shape == (2, K, 0)
 
 
 def test_distances_are_those_of_the_trajectories(scenes: list[Scene]) -> None:
