@@ -11,10 +11,12 @@ from torchrl.envs import TransformedEnv
 
 from dpa.policy import MotionActor, MotionLM
 from dpa.policy.actor import Contexts
+from dpa.ranking import transport_cost
 from dpa.tokens import TokenAction, VerletTokenizer
 from envs import keys
 from envs.sources.tfrecord import frame
 from envs.traffic import TrafficEnv
+from recipes.benchmark import transport
 from recipes.benchmark.__main__ import main
 from recipes.benchmark.realism import crowded_scene, noisy_log
 from recipes.benchmark.rollout import NaiveActor, UncachedActor
@@ -74,6 +76,36 @@ def test_rollouts_are_measured_and_planned_with(tmp_path: Path, capsys: pytest.C
     assert hours["collect and rank"] == pytest.approx(
         487_000 * 64 * 50 * 80 / rows[4]["agent_steps_per_second"] / 4 / 3600
     )
+
+
+def test_transport_is_measured_against_a_loop_over_pot(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(transport, "RANKED_AGENTS", 3)
+    monkeypatch.setattr(transport, "RANKED_ROLLOUTS", 2)
+    out = tmp_path / "transport.json"
+    small = ["--problems", "48", "--steps", "20", "--threads", "2", "--repeats", "1"]
+    assert main(["transport", *small, "--json", str(out)]) == 0
+    assert "times the loop" in " ".join(capsys.readouterr().out.split())
+    *rows, ranking = json.loads(out.read_text())["rows"]
+    assert [row["how"].split(",")[0] for row in rows] == [
+        *("loop over ot.emd2", "exact", "exact", "exact at 2 Hz", "windowed", "sinkhorn", "time_aligned")
+    ]
+    assert all(row["seconds"] > 0 and row["problems_per_second"] > 0 for row in rows)
+    assert [row["spearman"] for row in rows[:3]] == [1, 1, 1]
+    assert ranking["agents"] == 3 and 0 < ranking["transport_seconds"] < ranking["seconds"]
+
+
+def test_the_loop_over_pot_gives_the_exact_distances() -> None:
+    clouds = transport.make_clouds(problems=16, steps=20)
+    x, y, valid, weights = clouds
+    want = transport_cost(x, y, valid, valid, weights).distance
+    torch.testing.assert_close(transport.pot_loop(clouds), want, rtol=1e-4, atol=1e-4)
+
+
+def test_sizes_that_cannot_be_measured_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["transport", "--steps", "81"]) == 2
+    assert "steps must be 5 to 80, got 81" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("kind", [NaiveActor, UncachedActor])

@@ -78,15 +78,16 @@ class TimeAligned:
 
 def _solve(problems: Problems, reach: float | None) -> Pairs:
     """The cheapest coupling of each problem, with a limit on the steps between partners where one is given."""
-    x, y, x_valid, y_valid = (v.cpu().numpy() for v in (problems.x, problems.y, problems.x_valid, problems.y_valid))
-    weights, device = problems.weights.cpu().numpy(), problems.x.device
+    x, y = ((value.double() * problems.weights.sqrt()).cpu().numpy() for value in (problems.x, problems.y))
+    x_valid, y_valid = (valid.cpu().numpy() for valid in (problems.x_valid, problems.y_valid))
+    device = problems.x.device
     problem, row, column, mass = [], [], [], []
     for index in range(len(problems)):
         rows, columns = np.flatnonzero(x_valid[index]), np.flatnonzero(y_valid[index])
         if len(rows) == 0 or len(columns) == 0:
             continue
-        # cdist takes differences before it squares them, and calculates in float64 whatever it is given.
-        cost = cdist(x[index][rows], y[index][columns], w=weights)
+        # cdist takes differences before it squares them: what is equal has a cost of 0.
+        cost = cdist(x[index][rows], y[index][columns])
         far = None if reach is None else _out_of_reach(rows, columns, reach)
         i, j, part = _assign(cost, far) if len(rows) == len(columns) else _transport(cost, far)
         problem.append(np.full(len(i), index))
