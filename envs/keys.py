@@ -83,6 +83,10 @@ FEATURE_SHARE: NestedKey = "feature_share"
 """``[S, K, D]``: share of each feature in the summed distance of the ranked agents."""
 RANK: NestedKey = "rank"
 """``[S, K]`` int64: 0 is the nearest rollout."""
+FEATURE_SHARE: NestedKey = "feature_share"
+"""``[S, K, D]``: share of each of the D features in the distance of each rollout (D may be 0)."""
+AGENT_KIND: NestedKey = "agent_kind"
+"""``[S, A]`` int64: class of each row, :class:`~envs.scene.AgentKind`."""
 
 # --- what a loss reads ----------------------------------------------------------------------------------------------
 LABELS: NestedKey = "labels"
