@@ -8,7 +8,6 @@ Run the same command again to go on after a kill.
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -25,7 +24,7 @@ from dpa.rollout.collector import rows_within
 from envs import keys
 from envs.progress import progress
 from envs.store import SceneStore
-from recipes.cli import CONFIG, build, finite, plain, recipe, write_json
+from recipes.cli import CONFIG, build, plain, recipe, write_json
 from recipes.models import open_policy, weights_digest
 from recipes.scenes import fingerprint, open_splits
 
@@ -76,9 +75,7 @@ def collect(cfg: DictConfig, scenes: SceneStore, policy: Path, seed: int, folder
                 precision=options.precision,
                 compile=options.compile,
             ):
-                groups = groups[[scene not in done for scene in groups[keys.SCENE].tolist()]]
-                writer.append(groups)
-                bar.update(len(groups))
+                bar.update(writer.append(groups))
     return PreferenceStore(folder)
 
 
@@ -89,7 +86,7 @@ def main(cfg: DictConfig) -> None:
     scenes = open_splits(cfg.scenes)[cfg.split]
     store = collect(cfg, scenes, Path(cfg.policy), cfg.seed, Path(cfg.output))
     if cfg.json is not None:
-        write_json(cfg.json, {name: finite(value) for name, value in asdict(data_card(store)).items()})
+        write_json(cfg.json, data_card(store).to_json())
     print(f"preferences of {len(store)} scenes: {cfg.output}")
 
 

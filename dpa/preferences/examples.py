@@ -15,7 +15,7 @@ def example_provenance(num_rollouts: int = 8) -> Provenance:
     return Provenance(
         policy="none",
         scenes="none",
-        ranking={"aggregate": "sum"},
+        ranking={"weights": {"speed": 1.0, "effort": 1.0}, "aggregate": "sum"},
         sampling={},
         seed=0,
         num_rollouts=num_rollouts,
@@ -25,7 +25,7 @@ def example_provenance(num_rollouts: int = 8) -> Provenance:
 
 
 def example_groups(num_scenes: int, first: int = 0, num_rollouts: int = 8, num_agents: int = 4) -> TensorDict:
-    """Made-up groups of batch size ``[num_scenes]``: scene i has between 2 and ``num_agents`` agents."""
+    """Made-up groups of batch size ``[num_scenes]``: scene i has between 2 and ``num_agents`` agents, of all classes."""
     generator = torch.Generator().manual_seed(first)
     size = (num_scenes, num_rollouts, num_agents)
     agents = 2 + (first + torch.arange(num_scenes)) % (num_agents - 1)
@@ -41,6 +41,8 @@ def example_groups(num_scenes: int, first: int = 0, num_rollouts: int = 8, num_a
             keys.AGENT_DISTANCE: agent_distance,
             keys.ADE: distance + torch.rand(size[:2], generator=generator),
             keys.AGENT_RANKED: there,
+            keys.AGENT_KIND: (1 + torch.arange(num_agents) % 3) * there,
+            keys.FEATURE_SHARE: torch.rand(*size[:2], 2, generator=generator).softmax(-1),
             keys.RANK: rank_of(distance),
         },
         batch_size=[num_scenes],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -9,9 +10,25 @@ from typing import Any
 
 import numpy as np
 
-FORMAT = 1
+from envs.shards import check_shape
+from envs.sources.fields import one_line, shown
+
+FORMAT = 2
 """Version of the store's layout."""
 METADATA_FILE = "metadata.json"
+MAX_METADATA = 1 << 20
+"""Bytes of the metadata file; a usual one has 1,000."""
+_SHAPE = {
+    "policy": str,
+    "scenes": str,
+    "ranking": {str: object},
+    "sampling": {str: object},
+    "seed": object,
+    "num_rollouts": int,
+    "horizon": int,
+    "vocab_size": int,
+}
+"""Of the fields of :class:`Provenance`, see :func:`~envs.shards.check_shape`."""
 
 
 class StoreError(ValueError):
@@ -43,13 +60,24 @@ class Provenance:
     vocab_size: int
 
     @property
+    def features(self) -> tuple[str, ...]:
+        """Names of the features that the preference distance weighs, in the order of the feature shares."""
+        return tuple(self.ranking.get("weights", ()))
+
+    @property
+    def digest(self) -> str:
+        """Names the origin; every file of a store carries it, so that files of another store are told."""
+        content = json.dumps({**asdict(self), "features": self.features}, sort_keys=True)
+        return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+    @property
     def token_dtype(self) -> type[np.integer]:
         """The smallest integer that holds a token."""
         return np.uint8 if self.vocab_size <= 256 else np.int16
 
     def to_json(self) -> str:
         """The text of the metadata file."""
-        return json.dumps({"format": FORMAT, **asdict(self)}, indent=2, sort_keys=True)
+        return json.dumps({"format": FORMAT, **asdict(self)}, indent=2)  # unsorted: features keep their order
 
     @classmethod
     def from_folder(cls, folder: Path) -> Provenance:
@@ -62,19 +90,24 @@ class Provenance:
         if not path.is_file():
             raise StoreError(f"{folder} is no preference store: it has no {METADATA_FILE}. Name the folder of a store.")
         try:
-            values = json.loads(path.read_text())
+            if path.stat().st_size > MAX_METADATA:
+                raise ValueError(f"more than {MAX_METADATA} bytes")
+            values = dict(json.loads(path.read_text(encoding="utf-8")))
             version = values.pop("format")
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except (OSError, RecursionError, ValueError, KeyError, TypeError) as error:
             raise StoreError(
-                f"{path} is not the metadata of a preference store ({error}); restore or delete it."
+                f"{path} is not the metadata of a preference store ({one_line(error)}); restore it, or collect anew into "
+                "another folder."
             ) from None
         if version != FORMAT:
-            raise StoreError(f"{path} has format {version} and this version reads {FORMAT}; generate the store again.")
-        missing = {field.name for field in fields(cls)} ^ set(values)
-        if missing:
             raise StoreError(
-                f"{path} lacks or does not know {sorted(missing)}; restore it or generate the store again."
+                f"{path} has format {shown(version)} and this version reads {FORMAT}; collect anew into another folder."
             )
+        try:
+            check_shape(values, _SHAPE, "it")
+            check_shape(values["ranking"].get("weights", {}), {str: object}, "its ranking.weights")
+        except ValueError as error:
+            raise StoreError(f"{path} is damaged ({error}); restore it, or collect anew into another folder.") from None
         return cls(**values)
 
     def check_same(self, other: Provenance, folder: Path) -> None:
@@ -84,7 +117,7 @@ class Provenance:
             StoreError: the message lists every field that differs.
         """
         # Through JSON, so that a tuple and the list that it was stored as are the same.
-        mine, theirs = json.loads(self.to_json()), json.loads(other.to_json())
+        mine, theirs = (json.loads(each.to_json()) | {"features": list(each.features)} for each in (self, other))
         differ = [f"{name} ({mine[name]!r} there, {theirs[name]!r} now)" for name in mine if mine[name] != theirs[name]]
         if differ:
             raise StoreError(

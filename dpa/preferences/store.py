@@ -1,17 +1,14 @@
-"""Ranked groups on disk: small, append-only, checked, and read through memory maps.
+"""Ranked groups on disk: packed, append-only, checked, read one by one.
 
-A store is a folder with ``metadata.json`` (what the groups came from) and one folder per chunk of scenes. Agents are
-ragged, so a chunk holds flat arrays with the number of agents of each scene. A chunk appears by one rename, complete
-with its checksums: whatever ends a writer, the store holds whole chunks only. :mod:`dpa.preferences.writer` writes.
+A store is a folder with ``metadata.json`` (what the groups came from) and files of some scenes each
+(:mod:`dpa.preferences.chunk`). A chunk appears by one rename, complete with its checksums: whatever ends a writer, the store
+holds whole chunks only. :mod:`dpa.preferences.writer` writes.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -19,27 +16,21 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from dpa.preferences.chunk import MENDING, ChunkRecord, chunk_files, intact, read_group, read_record
+from dpa.preferences.group import Group, check_group, pad_groups
 from dpa.preferences.provenance import Provenance, StoreError
-from dpa.ranking.distance import rank_of
-from envs import keys
-
-CHECKSUM_FILE = "checksums.json"
-CHUNK_PREFIX = "chunk-"
-
-SCENE_ARRAYS = ("scene", "num_agents", "distance", "ade")
-"""Arrays with one row per scene: ``[n]``, ``[n]``, ``[n, K]``, ``[n, K]``."""
-AGENT_ARRAYS = ("tokens", "token_valid", "agent_distance", "agent_ranked")
-"""Arrays with one row per agent: ``[m, K, T]``, ``[m, T]``, ``[m, K]``, ``[m]``."""
 
 
 class PreferenceStore:
-    """Read-only view of a store; indexing gives a padded tensordict of batch size ``[S]``.
+    """Read-only view of a store as it is now, groups in the order of their scenes; nothing is kept open.
+
+    Indexing gives a padded tensordict of batch size ``[S]``. What others append later is seen by a new view.
 
     Args:
         folder: of the store.
 
     Raises:
-        StoreError: the folder is no store, or a chunk is damaged.
+        StoreError: the folder is no store, or the record of a chunk is damaged.
 
     Examples:
         >>> import tempfile
@@ -48,6 +39,7 @@ class PreferenceStore:
         >>> folder = tempfile.mkdtemp()
         >>> with PreferenceWriter(folder, example_provenance()) as writer:
         ...     writer.append(example_groups(num_scenes=3))
+        3
         >>> store = PreferenceStore(folder)
         >>> len(store), store[[2, 0]]["tokens"].shape
         (3, torch.Size([2, 8, 4, 16]))
@@ -56,13 +48,21 @@ class PreferenceStore:
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
         self.provenance = Provenance.from_folder(self.folder)
-        self._chunks = [_open_chunk(path) for path in chunk_folders(self.folder)]
-        sizes = [len(chunk["scene"]) for chunk in self._chunks]
-        self._first = np.cumsum([0, *sizes])
-        self._agent_first = [np.cumsum([0, *chunk["num_agents"].tolist()]) for chunk in self._chunks]
+        self._files = chunk_files(self.folder)
+        self._records = [read_record(path, self.provenance) for path in self._files]
+        scenes, agents = (
+            torch.tensor([value for record in self._records for value in getattr(record, name)], dtype=torch.int64)
+            for name in ("scenes", "num_agents")
+        )
+        order = scenes.argsort(stable=True)
+        places = [(chunk, row) for chunk, record in enumerate(self._records) for row in range(len(record.scenes))]
+        self._places = np.array(places, np.int64).reshape(-1, 2)[order.numpy()]
+        self.scenes, self.num_agents = scenes[order], agents[order]
+        """``[S]`` int64: the scene of each group, and its rows of agents."""
+        self._check()
 
     def __len__(self) -> int:
-        return int(self._first[-1])
+        return len(self.scenes)
 
     def __getitem__(self, index: int | slice | Sequence[int] | Tensor) -> TensorDict:
         """Some groups, agents padded to the largest of them (see :meth:`read`)."""
@@ -70,161 +70,112 @@ class PreferenceStore:
             index = range(len(self))[index]
         return self.read([index] if isinstance(index, int) else index)
 
-    @cached_property
-    def scenes(self) -> Tensor:
-        """``[S]`` int64: the scene of each group."""
-        return self._column("scene")
-
-    @cached_property
-    def num_agents(self) -> Tensor:
-        """``[S]`` int64: rows of agents of each group."""
-        return self._column("num_agents")
-
-    @cached_property
+    @property
     def distance(self) -> Tensor:
-        """``[S, K]`` of all groups."""
-        return self._column("distance")
+        """``[S, K]`` of all groups; looking at it the first time unpacks every group."""
+        return self._scene_values[0].clone()
 
-    @cached_property
+    @property
     def ade(self) -> Tensor:
-        """``[S, K]`` of all groups [m]."""
-        return self._column("ade")
+        """``[S, K]`` of all groups [m]; like :attr:`distance`."""
+        return self._scene_values[1].clone()
 
-    def ranked_agents(self) -> Tensor:
-        """``[S]`` int64: agents of each group that took part in its ranking."""
-        counts = [
-            torch.tensor([int(chunk["agent_ranked"][a:b].sum()) for a, b in pairwise(first)])
-            for chunk, first in zip(self._chunks, self._agent_first, strict=True)
-        ]
-        return torch.cat([torch.empty(0, dtype=torch.int64), *counts])
+    @property
+    def num_bytes(self) -> int:
+        """Of all files of the chunks."""
+        return sum(path.stat().st_size for path in self._files)
 
     def read(self, index: Iterable[int] | Tensor, num_agents: int | None = None) -> TensorDict:
-        """Copy groups into memory.
+        """Copy groups into memory; only their own blocks are read.
 
         Args:
             index: ``[S]`` positions in the store.
-            num_agents: A to pad to; by default the largest group asked for. Rows at the end that neither act nor are
-                ranked were not kept, so A can be smaller than in the environment.
+            num_agents: A to pad to; by default the largest group asked for. Rows at the end that neither act, nor are
+                ranked, nor are of a class were not kept, so A can be smaller than in the environment.
 
         Returns:
-            batch size ``[S]``, keys ``SCENE`` and those of :mod:`envs.keys` from ``TOKENS`` to ``RANK``.
+            batch size ``[S]``, keys ``SCENE`` and those of a ranked group of :mod:`envs.keys`.
 
         Raises:
             IndexError: a position outside the store.
+            StoreError: a group is damaged.
             ValueError: ``num_agents`` is below the number of agents of a group.
         """
-        groups = [self._group(int(i)) for i in index]
-        sizes = [len(group["tokens"]) for group in groups]
-        num_agents = max(sizes, default=0) if num_agents is None else num_agents
-        if max(sizes, default=0) > num_agents:
-            raise ValueError(
-                f"num_agents must be at least {max(sizes)}, the largest group asked for; got {num_agents}."
-            )
-        k, t = self.provenance.num_rollouts, self.provenance.horizon
-        out = {
-            "tokens": torch.zeros(len(groups), num_agents, k, t, dtype=torch.int64),
-            "token_valid": torch.zeros(len(groups), num_agents, t, dtype=torch.bool),
-            "agent_distance": torch.zeros(len(groups), num_agents, k),
-            "agent_ranked": torch.zeros(len(groups), num_agents, dtype=torch.bool),
-            "scene": torch.zeros(len(groups), dtype=torch.int64),
-            "distance": torch.zeros(len(groups), k),
-            "ade": torch.zeros(len(groups), k),
-        }
-        for row, (group, size) in enumerate(zip(groups, sizes, strict=True)):
-            for name in AGENT_ARRAYS:
-                out[name][row, :size] = torch.from_numpy(np.array(group[name]))
-            for name in ("scene", "distance", "ade"):
-                out[name][row] = torch.from_numpy(np.array(group[name]))
-        return TensorDict(
-            {
-                keys.SCENE: out["scene"],
-                keys.TOKENS: out["tokens"].transpose(1, 2).contiguous(),
-                keys.TOKEN_VALID: out["token_valid"],
-                keys.DISTANCE: out["distance"],
-                keys.AGENT_DISTANCE: out["agent_distance"].transpose(1, 2).contiguous(),
-                keys.ADE: out["ade"],
-                keys.AGENT_RANKED: out["agent_ranked"],
-                keys.RANK: rank_of(out["distance"]),
-            },
-            batch_size=[len(groups)],
-        )
+        groups = [self.group(int(i)) for i in index]
+        largest = max((len(group.tokens) for group in groups), default=0)
+        if num_agents is not None and largest > num_agents:
+            raise ValueError(f"num_agents must be at least {largest}, the largest group asked for; got {num_agents}.")
+        num_features = self._records[0].num_features if self._records else 0
+        return pad_groups(groups, self.provenance, num_features, largest if num_agents is None else num_agents)
 
-    def _group(self, index: int) -> dict[str, np.ndarray]:
-        """Views of the arrays of one group, one row per agent where a row is an agent."""
+    def group(self, index: int) -> Group:
+        """One group without padding.
+
+        Raises:
+            IndexError: a position outside the store.
+            StoreError: it is damaged.
+        """
         if not -len(self) <= index < len(self):
             raise IndexError(f"group {index} is outside {self.folder}, which holds {len(self)}.")
-        index %= len(self)
-        number = int(np.searchsorted(self._first, index, side="right")) - 1
-        chunk, row = self._chunks[number], index - self._first[number]
-        agents = slice(*self._agent_first[number][row : row + 2])
-        return {name: chunk[name][row] for name in SCENE_ARRAYS} | {name: chunk[name][agents] for name in AGENT_ARRAYS}
+        chunk, row = self._places[index].tolist()
+        return read_group(self._files[chunk], self._records[chunk], row, self.provenance)
 
-    def _column(self, name: str) -> Tensor:
-        shape = (0,) if name in ("scene", "num_agents") else (0, self.provenance.num_rollouts)
-        dtype = torch.int64 if len(shape) == 1 else torch.float32
-        return torch.cat(
-            [torch.empty(shape, dtype=dtype), *(torch.from_numpy(np.array(c[name])) for c in self._chunks)]
-        )
+    def __iter__(self) -> Iterator[Group]:
+        return (self.group(index) for index in range(len(self)))
 
+    @cached_property
+    def _scene_values(self) -> Tensor:
+        """Distance and ADE ``[2, S, K]``."""
+        values = np.empty((2, len(self), self.provenance.num_rollouts), np.float32)
+        for row, group in enumerate(self):
+            values[:, row] = group.distance, group.ade
+        return torch.from_numpy(values)
 
-def chunk_folders(folder: Path) -> list[Path]:
-    """The complete chunks of a store, in order of writing."""
-    return sorted(path for path in folder.iterdir() if path.name.startswith(CHUNK_PREFIX))
+    def _check(self) -> None:
+        if len({record.num_features for record in self._records}) > 1:
+            raise StoreError(f"{self.folder}: chunks have shares of different numbers of features; collect anew.")
+        again = (self.scenes[1:] == self.scenes[:-1]).nonzero()
+        if len(again):
+            row = int(again[0])
+            first, second = (self._files[chunk].name for chunk in self._places[row : row + 2, 0])
+            raise StoreError(
+                f"{self.folder}: scene {int(self.scenes[row])} is in {first} and in {second}; delete one of the two and "
+                "collect again what is then missing."
+            )
 
 
 def verify(folder: str | Path) -> list[str]:
-    """Read every byte of a store and compare it with its checksums.
+    """Read every byte of a store, compare it with its checksums, and check what must hold for every group.
 
     Returns:
         one line for each problem; empty when the store is sound.
+
+    Raises:
+        StoreError: the folder is no store.
     """
     folder = Path(folder)
-    Provenance.from_folder(folder)
+    origin = Provenance.from_folder(folder)
     problems: list[str] = []
-    seen: dict[int, str] = {}
-    for chunk in chunk_folders(folder):
-        found = _damage(chunk)
-        problems += found
-        if found:
-            continue
-        for scene in np.load(chunk / "scene.npy", allow_pickle=False).tolist():
-            if scene in seen:
-                problems.append(f"{chunk.name}: scene {scene} is in {seen[scene]} too; delete one of the two chunks.")
-            seen.setdefault(scene, chunk.name)
+    for path in chunk_files(folder):
+        try:
+            if not intact(path):
+                raise StoreError(f"{path} is not what its name says; {MENDING}.")
+            record = read_record(path, origin)
+            for row in range(len(record.scenes)):
+                _check_stored(path, record, row, origin)
+        except (OSError, StoreError) as error:
+            problems.append(str(error))
+    if not problems:
+        try:
+            PreferenceStore(folder)
+        except StoreError as error:
+            problems.append(str(error))
     return problems
 
 
-def checksum(path: Path) -> str:
-    """SHA-256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _damage(chunk: Path) -> list[str]:
-    """What is wrong with the files of one chunk."""
-    fix = "delete the chunk and generate its scenes again."
+def _check_stored(path: Path, record: ChunkRecord, row: int, origin: Provenance) -> None:
+    group = read_group(path, record, row, origin)
     try:
-        wanted = json.loads((chunk / CHECKSUM_FILE).read_text())
-    except (OSError, ValueError) as error:
-        return [f"{chunk.name}: no readable {CHECKSUM_FILE} ({error}); {fix}"]
-    problems = []
-    for name in (f"{array}.npy" for array in (*SCENE_ARRAYS, *AGENT_ARRAYS)):
-        if not (chunk / name).is_file():
-            problems.append(f"{chunk.name}: {name} is missing; {fix}")
-        elif checksum(chunk / name) != wanted.get(name):
-            problems.append(f"{chunk.name}: {name} does not match its checksum; {fix}")
-    return problems
-
-
-def _open_chunk(chunk: Path) -> dict[str, np.ndarray]:
-    try:
-        # Read-only maps: nothing that is done to what a store returns can reach the disk.
-        return {
-            name: np.load(chunk / f"{name}.npy", mmap_mode="r", allow_pickle=False)
-            for name in (*SCENE_ARRAYS, *AGENT_ARRAYS)
-        }
-    except (OSError, ValueError) as error:
-        raise StoreError(
-            f"{chunk} is damaged ({error}); delete it and generate its scenes again. To find other damage: "
-            f"python -m dpa.preferences verify {chunk.parent}"
-        ) from None
+        check_group(group, origin)
+    except StoreError as error:
+        raise StoreError(f"{path}, {error}") from None

@@ -1,41 +1,43 @@
-"""Writing a preference store: chunk by chunk, atomically, resumable."""
+"""Writing a preference store: chunk by chunk, atomically, from any number of processes and machines."""
 
 from __future__ import annotations
 
 import fcntl
-import json
 import os
-import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import IO
+from uuid import uuid4
 
 import numpy as np
-import torch
-from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from tensordict import TensorDictBase
 
+from dpa.preferences.chunk import PREFIX, PackedGroup, chunk_content, chunk_files, chunk_name, read_record
+from dpa.preferences.codec import encode
+from dpa.preferences.group import Group, take_groups
 from dpa.preferences.provenance import METADATA_FILE, Provenance, StoreError
-from dpa.preferences.store import (
-    CHECKSUM_FILE,
-    CHUNK_PREFIX,
-    SCENE_ARRAYS,
-    PreferenceStore,
-    checksum,
-    chunk_folders,
-)
-from envs import keys
 
-_UNFINISHED = ".unfinished-"
-_LOCK = ".writer"
+LOCK_SECONDS = 300.0
+"""A chunk is written in far less than a second; who holds the lock for longer has lost its file system."""
+LOCK_FILE = ".lock"
+PARTIAL_PREFIX = ".partial-"
+"""Files that are being written. They are made under the lock only, so whoever holds it may remove all others."""
 
 
 class PreferenceWriter:
-    """Appends ranked groups to a store; the only writer of its folder while it is open.
+    """Appends ranked groups to a store, together with whoever else does.
 
-    Groups wait in memory until ``chunk_scenes`` of them make a chunk; :meth:`close`, or the end of a ``with`` block,
-    writes the rest. A chunk is written aside, synchronised and renamed, so a process that is killed loses at most the
-    chunk in progress. To resume, open the folder again with the same provenance and leave out :attr:`scenes_done`.
+    Groups wait in memory, packed, until ``chunk_scenes`` of them make a chunk; :meth:`close`, or the end of a ``with``
+    block, writes the rest. A chunk is written aside, synchronised and renamed, so a process that is killed loses at most
+    what waits. To resume, open the folder again with the same provenance and leave out :attr:`scenes_done`.
+
+    Any number of writers may append at the same time, also from several machines on a file system that they share and that
+    knows locks (``flock``). Only while a chunk is written does its writer hold the folder's lock; it then looks which scenes
+    have come in the meantime. **A scene is stored once, and the first wins**: a group follows from scene, policy, options and
+    seed, so a second one says the same.
 
     Args:
         folder: of the store; made if missing.
@@ -43,7 +45,7 @@ class PreferenceWriter:
         chunk_scenes: scenes of one chunk.
 
     Raises:
-        StoreError: the folder holds groups of another origin, is not a store and not empty, or is being written.
+        StoreError: the folder holds groups of another origin, or is not a store and not empty.
 
     Examples:
         >>> import tempfile
@@ -51,6 +53,7 @@ class PreferenceWriter:
         >>> folder = tempfile.mkdtemp()
         >>> with PreferenceWriter(folder, example_provenance()) as writer:
         ...     writer.append(example_groups(num_scenes=3))
+        3
         >>> with PreferenceWriter(folder, example_provenance()) as writer:
         ...     sorted(writer.scenes_done)
         [0, 1, 2]
@@ -62,57 +65,54 @@ class PreferenceWriter:
         if not 1 <= provenance.vocab_size <= np.iinfo(np.int16).max + 1:
             raise ValueError(f"a vocabulary of {provenance.vocab_size} tokens does not fit the 16 bits of a store.")
         self.folder, self.provenance, self.chunk_scenes = Path(folder), provenance, chunk_scenes
+        self._waiting: dict[int, PackedGroup] = {}
+        self._stored: set[int] = set()
+        self._seen: set[str] = set()
+        self._num_features: int | None = None
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._lock = _lock(self.folder)
-        try:
-            self._open()
-        except BaseException:
-            self._lock.close()
-            raise
-
-    def _open(self) -> None:
-        if (self.folder / METADATA_FILE).exists():
+        self._check_folder()
+        with _locked(self.folder), _new_file(self.folder) as file:
+            if not (self.folder / METADATA_FILE).exists():
+                _put(file, self.provenance.to_json().encode(), self.folder / METADATA_FILE)
             Provenance.from_folder(self.folder).check_same(self.provenance, self.folder)
-        else:
-            strange = sorted(p.name for p in self.folder.iterdir() if not p.name.startswith((_UNFINISHED, _LOCK)))
-            if strange:
-                raise StoreError(f"{self.folder} is no preference store and holds {strange[:3]}; name an empty folder.")
-            _write(self.folder / METADATA_FILE, self.provenance.to_json())
-        for leftover in self.folder.glob(f"{_UNFINISHED}*"):  # of a writer that was killed: the lock says it is gone
-            shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
-        self._stored = set(PreferenceStore(self.folder).scenes.tolist())
-        self._pending: list[dict[str, np.ndarray]] = []
-        numbers = [int(path.name.removeprefix(CHUNK_PREFIX)) for path in chunk_folders(self.folder)]
-        self._next = max(numbers, default=-1) + 1
+            self._look()
+
+    def _check_folder(self) -> None:
+        ours = (METADATA_FILE, PREFIX, LOCK_FILE, PARTIAL_PREFIX)
+        strange = sorted(path.name for path in self.folder.iterdir() if not path.name.startswith(ours))
+        if strange and not (self.folder / METADATA_FILE).exists():
+            raise StoreError(f"{self.folder} is no preference store and holds {strange[:3]}; name an empty folder.")
 
     @property
     def scenes_done(self) -> frozenset[int]:
-        """Scenes whose groups are on disk for good."""
+        """Scenes whose groups are on disk for good, as of the last look: when opened, and at every chunk written."""
         return frozenset(self._stored)
 
-    def append(self, groups: TensorDictBase) -> None:
+    def append(self, groups: TensorDictBase) -> int:
         """Take groups, batch size ``[S]``, as :class:`~dpa.ranking.transform.RankRollouts` gives them.
 
+        Returns:
+            how many were taken; those of scenes that are there or wait already are left out.
+
         Raises:
-            StoreError: a scene is there already, or a value does not fit the store; nothing of ``groups`` is taken.
+            StoreError: a value does not fit the store; nothing of ``groups`` is taken.
         """
-        scenes = groups[keys.SCENE].tolist()
-        known = self._stored | {int(group["scene"]) for group in self._pending}
-        twice = sorted({scene for scene in scenes if scene in known or scenes.count(scene) > 1})
-        if twice:
-            raise StoreError(f"{self.folder}: scenes {twice[:5]} would be stored twice; leave out writer.scenes_done.")
-        self._check(groups)
-        self._pending += [self._group(group) for group in groups.cpu()]
-        while len(self._pending) >= self.chunk_scenes:
-            self._flush(self.chunk_scenes)
+        known = self._stored | self._waiting.keys()
+        new = {}
+        for group in self._checked(groups):
+            if group.scene not in known and group.scene not in new:
+                new[group.scene] = PackedGroup(
+                    group.scene, len(group.tokens), group.feature_share.shape[-1], encode(group, self.provenance.token_dtype)
+                )
+        self._waiting |= new
+        while len(self._waiting) >= self.chunk_scenes:
+            self._flush()
+        return len(new)
 
     def close(self) -> None:
-        """Write what waits, and let other writers in."""
-        try:
-            if self._pending:
-                self._flush(len(self._pending))
-        finally:
-            self._lock.close()
+        """Write what waits."""
+        while self._waiting:
+            self._flush()
 
     def __enter__(self) -> PreferenceWriter:
         return self
@@ -122,96 +122,98 @@ class PreferenceWriter:
     ) -> None:
         if kind is None:
             self.close()
-        else:
-            self._lock.close()
 
-    def _check(self, groups: TensorDictBase) -> None:
-        tokens, valid = groups[keys.TOKENS], groups[keys.TOKEN_VALID]
-        origin = self.provenance
-        if tokens.shape[1] != origin.num_rollouts or tokens.shape[-1] != origin.horizon:
-            raise StoreError(
-                f"{self.folder} holds groups of {origin.num_rollouts} rollouts and {origin.horizon} decisions, got "
-                f"{tokens.shape[1]} and {tokens.shape[-1]}."
-            )
-        used = tokens[valid[:, None].expand_as(tokens)]
-        if used.numel() and (int(used.min()) < 0 or int(used.max()) >= origin.vocab_size):
-            raise StoreError(
-                f"{self.folder}: tokens from {int(used.min())} to {int(used.max())} are outside the vocabulary of "
-                f"{origin.vocab_size}; give the vocab_size of the tokenizer."
-            )
-        for key in (keys.DISTANCE, keys.AGENT_DISTANCE, keys.ADE):
-            if not torch.isfinite(groups[key]).all():
-                bad = groups[keys.SCENE][~torch.isfinite(groups[key]).flatten(1).all(-1)][0]
-                raise StoreError(f"{self.folder}: scene {int(bad)} has a {key} that is not finite; rank it again.")
-
-    def _group(self, group: TensorDict) -> dict[str, np.ndarray]:
-        """Arrays of one scene, agents first, without the padding at the end."""
-        valid, ranked = group[keys.TOKEN_VALID], group[keys.AGENT_RANKED]
-        used = (valid.any(-1) | ranked).nonzero()
-        size = int(used.max()) + 1 if len(used) else 0
-        tokens = torch.where(valid, group[keys.TOKENS], 0)
-
-        def rows(value: Tensor) -> Tensor:
-            return value.transpose(0, 1)[:size]
-
-        return {
-            "scene": np.int64(int(group[keys.SCENE])),
-            "num_agents": np.int64(size),
-            "distance": group[keys.DISTANCE].float().numpy(),
-            "ade": group[keys.ADE].float().numpy(),
-            "tokens": rows(tokens).numpy().astype(self.provenance.token_dtype),
-            "token_valid": valid[:size].numpy(),
-            "agent_distance": rows(group[keys.AGENT_DISTANCE]).float().numpy(),
-            "agent_ranked": ranked[:size].numpy(),
-        }
-
-    def _flush(self, size: int) -> None:
-        """Write the first ``size`` waiting groups as one chunk."""
-        groups = self._pending[:size]
-        aside = self.folder / f"{_UNFINISHED}{self._next:08d}"
+    def _checked(self, groups: TensorDictBase) -> list[Group]:
         try:
-            aside.mkdir()
-            _write_arrays(aside, groups)
-            aside.rename(self.folder / f"{CHUNK_PREFIX}{self._next:08d}")
-        except BaseException:
-            shutil.rmtree(aside, ignore_errors=True)
-            raise
-        self._next += 1
-        self._pending = self._pending[size:]
-        self._stored |= {int(group["scene"]) for group in groups}
+            taken = take_groups(groups, self.provenance)
+        except StoreError as error:
+            raise StoreError(f"{self.folder}: {error}") from None
+        if taken:
+            self._same_features(taken[0].feature_share.shape[-1])
+        return taken
+
+    def _same_features(self, number: int) -> None:
+        """All groups of a store have as many feature shares: of every feature that the distance weighs, or none."""
+        known = {0, len(self.provenance.features)} if self._num_features is None else {self._num_features}
+        if number not in known:
+            raise StoreError(
+                f"{self.folder}: groups with shares of {number} features where {sorted(known)} are kept; rank with the "
+                "options of this store, or name a new folder."
+            )
+        self._num_features = number
+
+    def _look(self) -> None:
+        """See what all writers have stored."""
+        for path in chunk_files(self.folder):
+            if path.name not in self._seen:
+                record = read_record(path, self.provenance)
+                self._same_features(record.num_features)
+                self._stored |= set(record.scenes)
+                self._seen.add(path.name)
+
+    def _flush(self) -> None:
+        """Write the groups that have waited longest as one chunk, but for those that another writer has stored."""
+        waited = list(self._waiting.values())[: self.chunk_scenes]
+        # The new file comes before the look: making one lets a network file system see what other machines have made.
+        with _locked(self.folder), _new_file(self.folder) as file:
+            self._look()
+            new = [group for group in waited if group.scene not in self._stored]
+            if new:
+                content = chunk_content(new, self.provenance)
+                _put(file, content, self.folder / chunk_name(content))
+        self._stored |= {group.scene for group in new}
+        for group in waited:
+            del self._waiting[group.scene]
 
 
-def _write_arrays(folder: Path, groups: list[dict[str, np.ndarray]]) -> None:
-    """The arrays of a chunk and their checksums."""
-    for name in groups[0]:
-        join = np.stack if name in SCENE_ARRAYS else np.concatenate
-        with (folder / f"{name}.npy").open("wb") as file:
-            np.save(file, join([group[name] for group in groups]), allow_pickle=False)
-            _synchronise(file)
-    sums = {path.name: checksum(path) for path in sorted(folder.glob("*.npy"))}
-    _write(folder / CHECKSUM_FILE, json.dumps(sums, indent=2))
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold a store alone; the system lets go when the process ends, however it ends."""
+    with (folder / LOCK_FILE).open("a") as lock:
+        _acquire(lock, folder)
+        for leftover in folder.glob(f"{PARTIAL_PREFIX}*"):  # of a writer that was killed: living ones hold the lock
+            leftover.unlink(missing_ok=True)
+        yield
 
 
-def _lock(folder: Path) -> IO[str]:
-    """Hold the folder for one writer; the system lets go when the process ends, however it ends."""
-    file = (folder / _LOCK).open("w")
+def _acquire(lock: IO[str], folder: Path) -> None:
+    end = time.monotonic() + LOCK_SECONDS
+    while True:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        except BlockingIOError:
+            if time.monotonic() > end:
+                raise StoreError(
+                    f"{folder / LOCK_FILE} was held by another writer for {LOCK_SECONDS:g} s; end the writer that hangs, "
+                    "then run the same command again."
+                ) from None
+        except OSError as error:
+            raise StoreError(
+                f"{folder} cannot be locked ({error.strerror}); write to a file system that knows flock."
+            ) from None
+        time.sleep(0.005)
+
+
+@contextmanager
+def _new_file(folder: Path) -> Iterator[IO[bytes]]:
+    """A file that is gone afterwards, unless it was put in place."""
+    path = folder / f"{PARTIAL_PREFIX}{uuid4().hex}"
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        file.close()
-        raise StoreError(f"{folder} is being written by another process; wait for it or name another folder.") from None
-    return file
+        with path.open("xb") as file:
+            yield file
+    finally:
+        path.unlink(missing_ok=True)
 
 
-def _write(path: Path, text: str) -> None:
-    """Put a small file in place at once."""
-    aside = path.with_name(f"{_UNFINISHED}{path.name}")
-    with aside.open("w") as file:
-        file.write(text)
-        _synchronise(file)
-    os.replace(aside, path)
-
-
-def _synchronise(file: IO) -> None:
+def _put(file: IO[bytes], content: bytes, path: Path) -> None:
+    """Fill a new file and put it in place at once, for good."""
+    file.write(content)
     file.flush()
     os.fsync(file.fileno())
+    os.replace(file.name, path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
