@@ -3,11 +3,13 @@
     python -m recipes.collect policy=runs/pretrain/policy.pt
     python -m dpa.preferences info runs/preferences
 
-Run the same command again to go on after a kill.
+Run the same command again to go on after a kill. Several commands may fill one folder at the same time: each skips what
+is stored when it starts and, with ``part`` and ``parts``, does a part of its own.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -21,7 +23,6 @@ from dpa.ranking import PreferenceDistance
 from dpa.ranking.transform import RankRollouts
 from dpa.rollout import Workers, make_collector
 from dpa.rollout.collector import rows_within
-from envs import keys
 from envs.progress import progress
 from envs.store import SceneStore
 from recipes.cli import CONFIG, build, plain, recipe, write_json
@@ -29,8 +30,15 @@ from recipes.models import open_policy, weights_digest
 from recipes.scenes import fingerprint, open_splits
 
 
-def collect(cfg: DictConfig, scenes: SceneStore, policy: Path, seed: int, folder: Path) -> PreferenceStore:
-    """Fill a preference store with ranked rollouts of every scene that it lacks.
+def collect(
+    cfg: DictConfig,
+    scenes: SceneStore,
+    policy: Path,
+    seed: int,
+    folder: Path,
+    indices: Sequence[int] | None = None,
+) -> PreferenceStore:
+    """Fill a preference store with ranked rollouts of the scenes that it lacks.
 
     Args:
         cfg: with the sections ``collection`` and ``device``.
@@ -38,7 +46,9 @@ def collect(cfg: DictConfig, scenes: SceneStore, policy: Path, seed: int, folder
         policy: file of the policy.
         seed: of the sampling.
         folder: of the store.
+        indices: scenes to roll out; all by default.
     """
+    indices = range(len(scenes)) if indices is None else indices
     options = cfg.collection
     model, context, _ = open_policy(policy, cfg.device)
     distance = build(PreferenceDistance, options.ranking, "collection.ranking")
@@ -59,11 +69,14 @@ def collect(cfg: DictConfig, scenes: SceneStore, policy: Path, seed: int, folder
     )
     with PreferenceWriter(folder, provenance, chunk_scenes=options.chunk_scenes) as writer:
         done = writer.scenes_done
-        with progress(total=len(scenes), description="collect", initial=len(done), unit="scene") as bar:
+        with progress(
+            total=len(indices), description="collect", initial=len(done.intersection(indices)), unit="scene"
+        ) as bar:
             for groups in make_collector(
                 scenes,
                 model,
                 num_rollouts=options.num_rollouts,
+                indices=indices,
                 done=done,
                 decoding=decoding,
                 options=context,
@@ -84,7 +97,10 @@ def collect(cfg: DictConfig, scenes: SceneStore, policy: Path, seed: int, folder
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.collect``."""
     scenes = open_splits(cfg.scenes)[cfg.split]
-    store = collect(cfg, scenes, Path(cfg.policy), cfg.seed, Path(cfg.output))
+    if not 0 <= cfg.part < cfg.parts:
+        raise ValueError(f"part must be from 0 to parts - 1, got part={cfg.part} of parts={cfg.parts}.")
+    indices = range(cfg.part, len(scenes), cfg.parts)
+    store = collect(cfg, scenes, Path(cfg.policy), cfg.seed, Path(cfg.output), indices)
     if cfg.json is not None:
         write_json(cfg.json, data_card(store).to_json())
     print(f"preferences of {len(store)} scenes: {cfg.output}")

@@ -24,7 +24,9 @@ def main(arguments: list[str] | None = None) -> int:
         command.add_argument("store", type=Path, help="folder of the store")
     options = parser.parse_args(arguments)
     try:
-        return _info(options.store, options.pairs, options.json) if options.command == "info" else _verify(options.store)
+        return (
+            _info(options.store, options.pairs, options.json) if options.command == "info" else _verify(options.store)
+        )
     except (OSError, ValueError) as error:
         sys.stderr.write(f"{error}\n")
         return 1

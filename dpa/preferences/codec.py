@@ -60,7 +60,9 @@ def encode(group: Group, token_dtype: type[np.integer] = np.uint8) -> bytes:
     noise = planes[:3].tobytes()
     size = len(alike) + len(noise)
     if size > MAX_BYTES:
-        raise StoreError(f"scene {group.scene}: {a} agents x {k} rollouts take more than {MAX_BYTES} bytes; roll out fewer.")
+        raise StoreError(
+            f"scene {group.scene}: {a} agents x {k} rollouts take more than {MAX_BYTES} bytes; roll out fewer."
+        )
     packer = zstandard.ZstdCompressor(level=LEVEL, write_checksum=True).compressobj(size=size)
     first = packer.compress(alike) + packer.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)
     return first + packer.compress(noise) + packer.flush()
@@ -87,7 +89,10 @@ def decode(block: bytes, token_dtype: type[np.integer] = np.uint8) -> Group:
         raise StoreError(f"its block has {len(data)} bytes where the header asks for {sum(sizes)}")
     _, bits, kind, tokens, planes = np.split(data, np.cumsum(sizes)[:-1])
     planes = np.roll(planes.reshape(4, numbers), -1, axis=0)
-    arrays = {"tokens": _values(tokens.reshape(token.itemsize, -1), token).astype(token_dtype), "agent_kind": kind.copy()}
+    arrays = {
+        "tokens": _values(tokens.reshape(token.itemsize, -1), token).astype(token_dtype),
+        "agent_kind": kind.copy(),
+    }
     arrays |= _parted(np.unpackbits(bits, count=flags).astype(bool), _FLAGS, shapes)
     arrays |= _parted(_values(planes, np.dtype("<f4")).astype(np.float32), NUMBERS, shapes)
     return Group(scene, **{name: array.reshape(shapes[name]) for name, array in arrays.items()})

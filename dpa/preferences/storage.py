@@ -55,7 +55,9 @@ class PreferenceStorage(Storage):
             raise ValueError(f"{store.folder} holds no scene yet; append groups to it first.")
         largest = int(store.num_agents.max())
         if num_agents is not None and largest > num_agents:
-            raise ValueError(f"num_agents must be at least {largest}, the largest group of {store.folder}; got {num_agents}.")
+            raise ValueError(
+                f"num_agents must be at least {largest}, the largest group of {store.folder}; got {num_agents}."
+            )
         super().__init__(max_size=len(store))
         self.store, self.num_agents = store, num_agents
 

@@ -102,7 +102,10 @@ class PreferenceWriter:
         for group in self._checked(groups):
             if group.scene not in known and group.scene not in new:
                 new[group.scene] = PackedGroup(
-                    group.scene, len(group.tokens), group.feature_share.shape[-1], encode(group, self.provenance.token_dtype)
+                    group.scene,
+                    len(group.tokens),
+                    group.feature_share.shape[-1],
+                    encode(group, self.provenance.token_dtype),
                 )
         self._waiting |= new
         while len(self._waiting) >= self.chunk_scenes:

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
+import random
+import signal
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 
-from dpa.preferences import PreferenceStore
+from dpa.preferences import PreferenceStore, verify
 from dpa.training.checkpoint import load_policy
 from dpa.training.loggers import read_curve
-from envs import keys
+from recipes.collect import main as collect_main
 
 pytestmark = pytest.mark.slow
 
@@ -64,16 +68,56 @@ def test_killed_training(
     assert read_curve(tmp_path / stage, curve) == read_curve(runs / stage, curve)
 
 
+def contents(folder: Path) -> dict[int, dict[str, torch.Tensor]]:
+    store = PreferenceStore(folder)
+    return {int(scene): dict(store[row].items()) for row, scene in enumerate(store.scenes)}
+
+
+def assert_same_preferences(mine: Path, whole: Path) -> None:
+    ours, theirs = contents(mine), contents(whole)
+    assert ours.keys() == theirs.keys()
+    for scene, group in ours.items():
+        for key, value in group.items():
+            assert torch.equal(value, theirs[scene][key]), (scene, key)
+    assert verify(mine) == []
+    assert not list(mine.glob(".partial-*"))
+
+
 def test_killed_collection(run: Callable, options: Callable, kill_when: Callable, runs: Path, tmp_path: Path) -> None:
     arguments = command("collect", options, runs, tmp_path)
     kill_when(lambda: list((tmp_path / "collect").glob("chunk*")), "collect", *arguments)
     assert len(PreferenceStore(tmp_path / "collect")) < 6
     assert run("collect", *arguments).status == 0
-    mine, whole = (PreferenceStore(folder / "collect") for folder in (tmp_path, runs))
-    assert mine.scenes.tolist() == whole.scenes.tolist()
-    for row in range(6):
-        for key in (keys.TOKENS, keys.DISTANCE, keys.AGENT_DISTANCE, keys.ADE, keys.RANK):
-            assert torch.equal(mine[row][key], whole[row][key]), key
+    assert_same_preferences(tmp_path / "collect", runs / "collect")
+
+
+def collect_here(arguments: list[str]) -> None:
+    """The command line in a process that has imported it already."""
+    sys.argv = ["collect", *arguments]
+    collect_main()
+
+
+def test_a_collection_killed_at_fifty_random_moments(options: Callable, runs: Path, tmp_path: Path) -> None:
+    """Started again after each kill; a store that is full before there were enough kills is begun anew."""
+    processes = multiprocessing.get_context("forkserver")
+    processes.set_forkserver_preload(["recipes.collect"])
+    draw, kills, folder, found = random.Random(0), 0, tmp_path / "0", set()
+    while kills < 50:
+        arguments = [*command("collect", options, runs, folder), "collection.chunk_scenes=1"]
+        process = processes.Process(target=collect_here, args=(arguments,), daemon=True)
+        process.start()
+        process.join(draw.uniform(0.5, 4.0))
+        process.kill()
+        process.join()
+        kills += process.exitcode == -signal.SIGKILL
+        if not (folder / "collect" / "metadata.json").exists():
+            continue
+        store = PreferenceStore(folder / "collect")
+        found.add(len(store))
+        if len(store) == 6:
+            assert_same_preferences(folder / "collect", runs / "collect")
+            folder = tmp_path / str(kills)
+    assert len(found) > 2, "kills came at different moments"
 
 
 def test_killed_evaluation(run: Callable, options: Callable, kill_when: Callable, runs: Path, tmp_path: Path) -> None:

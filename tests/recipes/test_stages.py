@@ -11,11 +11,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from omegaconf import OmegaConf
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig, OmegaConf
 
 from dpa.losses import ContrastivePreferenceLoss, token_network
 from dpa.policy import MotionLM, make_context
-from dpa.preferences import PreferenceStore
+from dpa.preferences import PreferenceStore, nearest_farthest
 from dpa.realism.score import score
 from dpa.realism.submission import validate
 from dpa.tokens import VerletTokenizer
@@ -28,12 +29,14 @@ from envs.sources.synthetic import straight_road
 from envs.store import SceneStore
 from recipes import evaluate as evaluation
 from recipes.align import parts_of
-from recipes.candidates import Group, pair_accuracy
+from recipes.candidates import Group, make_candidates, pair_accuracy
+from recipes.cli import CONFIG
 from recipes.evaluate import SCENE_FIGURES, standing_moved
 from recipes.models import open_policy
 from recipes.partial import PartialResult
 from recipes.pool import Job, Workers
 from recipes.rolled import Rolled
+from recipes.scenes import open_splits
 
 METHODS = ("dpa_omf", "dpa_adef", "sft_best_oa", "sft_best_ade", "adversarial_afd")
 
@@ -94,7 +97,7 @@ def contents(folder: Path) -> dict[int, list]:
     """Scene -> everything that the store keeps of it."""
     store = PreferenceStore(folder)
     return {
-        int(scene): [store[row][key].tolist() for key in (keys.TOKENS, keys.DISTANCE, keys.ADE, keys.RANK)]
+        int(scene): [value.tolist() for _, value in sorted(store[row].items())]
         for row, scene in enumerate(store.scenes)
     }
 
@@ -128,16 +131,32 @@ def test_collecting_goes_on_where_it_stopped_even_inside_a_group(
 
     with monkeypatch.context() as patch:
         patch.setattr(collecting, "make_collector", stop_after_two)
-        patch.setattr(
-            collecting.PreferenceWriter, "__exit__", lambda writer, *_: writer._lock.close()
-        )  # as a kill does
+        patch.setattr(collecting.PreferenceWriter, "__exit__", lambda *_: None)  # as a kill does
         assert run("collect", *command).status == 1
     kept = PreferenceStore(tmp_path / "preferences").scenes.tolist()
     assert 0 < len(kept) < 6
     assert run("collect", *command).status == 0
     assert contents(tmp_path / "preferences") == contents(runs / "preferences")
-    order = [PreferenceStore(folder).scenes.tolist() for folder in (tmp_path / "preferences", runs / "preferences")]
-    assert order[0] == order[1]
+
+
+def test_two_commands_share_the_scenes_of_one_folder(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path
+) -> None:
+    command = collect_into(tmp_path / "preferences", runs, options)
+    first = run("collect", *command, "part=1", "parts=2")
+    assert first.status == 0 and "preferences of 3 scenes" in first.out
+    second = run("collect", *command, "part=0", "parts=2")
+    assert second.status == 0 and "preferences of 6 scenes" in second.out and "3/3" in second.err
+    assert contents(tmp_path / "preferences") == contents(runs / "preferences")
+    outcome = run("collect", *command, "part=2", "parts=2")
+    assert outcome.status == 2 and "part must be from 0 to parts - 1, got part=2 of parts=2" in outcome.err
+
+
+def test_the_data_card_is_written_on_request(run: Callable, options: Callable, runs: Path, tmp_path: Path) -> None:
+    command = collect_into(runs / "preferences", runs, options)
+    assert run("collect", *command, f"json={tmp_path / 'card.json'}").status == 0
+    card = json.loads((tmp_path / "card.json").read_text())
+    assert card["scenes"] == 6 and card["classes"]["vehicle"]["agents"] == card["agents"]
 
 
 @pytest.mark.slow
@@ -178,6 +197,72 @@ def test_collecting_again_adds_nothing(run: Callable, options: Callable, runs: P
     outcome = run("collect", *collect_into(runs / "preferences", runs, options))
     assert outcome.status == 0 and "preferences of 6 scenes" in outcome.out
     assert contents(runs / "preferences") == before
+
+
+# --- candidates -----------------------------------------------------------------------------------------------------
+def compose_recipe(recipe: str, options: Callable, runs: Path) -> DictConfig:
+    """Options of a recipe on the results of ``runs``."""
+    with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):
+        return compose(recipe, options(recipe, f"policy={runs}", f"preferences={runs}"))
+
+
+def pairs_of(runs: Path, options: Callable, **data: object) -> list[Group]:
+    """Pairs of the preferences, with ``data`` over those of DPA-OMF."""
+    cfg = compose_recipe("align", options, runs)
+    scenes = open_splits(cfg.scenes).train
+    store = PreferenceStore(runs / "preferences")
+    model, context, _ = open_policy(runs / "reference/policy.pt")
+    section = OmegaConf.merge(cfg.method.data, {"num": 2}, data)
+    return make_candidates(section, store, scenes, context, model.tokenizer, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("data", "counts"),
+    [
+        ({}, [2] * 6),
+        ({"pairs": "random"}, [2] * 6),
+        ({"pairs": "all", "num": None}, [6] * 6),
+        ({"pairs": "all", "num": None, "rankings_per_scene": 4}, [4] * 6),
+        ({"rankings_per_scene": 0.5}, [1] * 3),
+        ({"rankings_per_scene": 1.5}, [1, 1, 1, 2, 2, 2]),
+    ],
+)
+def test_the_options_of_a_method_decide_its_pairs(
+    runs: Path, options: Callable, data: dict[str, object], counts: list[int]
+) -> None:
+    groups = pairs_of(runs, options, **data)
+    assert sorted(len(group.preferred) for group in groups) == counts
+    assert all(group.preferred.shape == group.unpreferred.shape for group in groups)
+    again = pairs_of(runs, options, **data)
+    assert all(torch.equal(a.preferred, b.preferred) for a, b in zip(groups, again, strict=True))
+
+
+def test_a_margin_leaves_the_clear_pairs(runs: Path, options: Callable) -> None:
+    store, margin = PreferenceStore(runs / "preferences"), 0.3
+    preferred, unpreferred = nearest_farthest(store.distance, 2)
+    gap = store.distance.gather(1, unpreferred) - store.distance.gather(1, preferred)
+    clear = (gap >= margin * store.distance.mean(1, keepdim=True)).sum(1)
+    assert 0 < int(clear.sum()) < 12, "some pairs on either side"
+    kept = [len(group.preferred) for group in pairs_of(runs, options, margin=margin)]
+    assert kept == [number for number in clear.tolist() if number]
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ({"pairs": "some"}, "method.data.pairs must be one of nearest_farthest, random, all, got 'some'"),
+        ({"pairs": "all"}, "method.data.num=2 asks for some; say method.data.num=null"),
+        ({"num": None}, "method.data.num must be a whole number, got None"),
+        ({"margin": 50.0}, "method.data.margin=50.0 leaves no pair"),
+        ({"margin": -1.0}, "a margin is 0 or more"),
+        ({"rankings_per_scene": 0}, "must be more than 0"),
+    ],
+)
+def test_options_that_give_no_pairs_are_told(
+    runs: Path, options: Callable, data: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        pairs_of(runs, options, **data)
 
 
 # --- align ----------------------------------------------------------------------------------------------------------

@@ -102,7 +102,13 @@ def test_a_group_of_the_papers_size_takes_at_most_40_kb_even_with_random_tokens(
 
 
 @settings(max_examples=40, deadline=None)
-@given(data=st.data(), agents=st.integers(0, 4), rollouts=st.integers(1, 5), decisions=st.integers(1, 4), shares=st.integers(0, 3))
+@given(
+    data=st.data(),
+    agents=st.integers(0, 4),
+    rollouts=st.integers(1, 5),
+    decisions=st.integers(1, 4),
+    shares=st.integers(0, 3),
+)
 def test_any_group_comes_back_to_the_last_bit(data, agents: int, rollouts: int, decisions: int, shares: int) -> None:
     def array(name: str, dtype: type, most: int) -> np.ndarray:
         return data.draw(arrays(dtype, shapes[name], elements=st.integers(0, most)), label=name)
@@ -143,7 +149,10 @@ def test_a_folder_with_other_things_is_refused(tmp_path: Path) -> None:
         PreferenceStore(tmp_path)
 
 
-@pytest.mark.parametrize("text", ["", "[]", "[" * 100_000, '{"format": 99}', '{"format": 1}', '{"format": 2, "policy": "x"}', " " * (1 << 21)])
+@pytest.mark.parametrize(
+    "text",
+    ["", "[]", "[" * 100_000, '{"format": 99}', '{"format": 1}', '{"format": 2, "policy": "x"}', " " * (1 << 21)],
+)
 def test_metadata_that_cannot_be_read_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "metadata.json").write_text(text)
     with pytest.raises(StoreError, match=r"metadata\.json"):
@@ -175,7 +184,10 @@ def test_a_store_without_feature_shares_gives_none(tmp_path: Path) -> None:
     with PreferenceWriter(tmp_path, example_provenance()) as writer:
         writer.append(groups)
     assert PreferenceStore(tmp_path)[:][keys.FEATURE_SHARE].shape == (2, 8, 0)
-    with PreferenceWriter(tmp_path, example_provenance()) as writer, pytest.raises(StoreError, match="2 features where .0"):
+    with (
+        PreferenceWriter(tmp_path, example_provenance()) as writer,
+        pytest.raises(StoreError, match="2 features where .0"),
+    ):
         writer.append(example_groups(1, first=2))
 
 

@@ -173,7 +173,9 @@ def test_a_file_system_without_locks_is_told(tmp_path: Path, monkeypatch: pytest
         raise OSError(95, "Operation not supported")
 
     monkeypatch.setattr(module.fcntl, "flock", unknown)
-    with pytest.raises(StoreError, match="cannot be locked .Operation not supported.; write to a file system that knows"):
+    with pytest.raises(
+        StoreError, match="cannot be locked .Operation not supported.; write to a file system that knows"
+    ):
         PreferenceWriter(tmp_path, example_provenance())
 
 
