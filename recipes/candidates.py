@@ -137,8 +137,8 @@ def _choose_pairs(data: DictConfig, store: PreferenceStore, seed: int) -> list[t
     kept = separated(distance, preferred, unpreferred, data.margin, relative=True)
     if not kept.any():
         raise ValueError(
-            f"method.data.margin={data.margin} leaves no pair: none differs by this share of its scene's mean distance; "
-            "lower it."
+            f"method.data.margin={data.margin} leaves no pair: none differs by this share of its scene's mean "
+            "distance; lower it."
         )
     if data.rankings_per_scene is not None:
         kept = thin_out(kept, data.rankings_per_scene, make_generator(seed, "rankings"))

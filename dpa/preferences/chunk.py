@@ -2,8 +2,9 @@
 
     magic | group | group | ... | record (JSON, packed) | length of the record | magic
 
-The file is named after its content: its name says whether all of it is as it was, and no two writers, on whatever machines,
-can give one name to different chunks. A group is one block of :mod:`dpa.preferences.codec` and is read alone, by one seek.
+The file is named after its content: its name says whether all of it is as it was, and no two writers, on whatever
+machines, can give one name to different chunks. A group is one block of :mod:`dpa.preferences.codec` and is read
+alone, by one seek.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ def example_provenance(num_rollouts: int = 8) -> Provenance:
 
 
 def example_groups(num_scenes: int, first: int = 0, num_rollouts: int = 8, num_agents: int = 4) -> TensorDict:
-    """Made-up groups of batch size ``[num_scenes]``: scene i has between 2 and ``num_agents`` agents, of all classes."""
+    """Made-up groups of batch size ``[num_scenes]``: scene i has 2 to ``num_agents`` agents, of all classes."""
     generator = torch.Generator().manual_seed(first)
     size = (num_scenes, num_rollouts, num_agents)
     agents = 2 + (first + torch.arange(num_scenes)) % (num_agents - 1)

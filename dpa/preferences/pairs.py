@@ -1,8 +1,8 @@
 """From a ranked group of rollouts to the pairs that a loss reads: pure functions on indices.
 
-Functions take distances ``[S, K]`` (any ranking: preference distance or ADE; smaller is better) or sizes, and give indices
-of rollouts ``[S, M]``. Ties go to the rollout with the smaller index. Scenes may keep different numbers of pairs: which ones
-is a mask ``[S, M]`` beside the indices.
+Functions take distances ``[S, K]`` (any ranking: preference distance or ADE; smaller is better) or sizes, and give
+indices of rollouts ``[S, M]``. Ties go to the rollout with the smaller index. Scenes may keep different numbers of
+pairs: which ones is a mask ``[S, M]`` beside the indices.
 """
 
 from __future__ import annotations
@@ -90,8 +90,8 @@ def all_pairs(distance: Tensor) -> tuple[Tensor, Tensor]:
         distance: ``[S, K]``.
 
     Returns:
-        preferred ``[S, M]`` int64 and unpreferred ``[S, M]`` int64, M = K (K - 1) / 2: the nearest against all others from
-        the next one on, then the second nearest, and so on.
+        preferred ``[S, M]`` int64 and unpreferred ``[S, M]`` int64, M = K (K - 1) / 2: the nearest against all others
+        from the next one on, then the second nearest, and so on.
 
     Raises:
         ValueError: there is one rollout only, or a distance is not finite.
@@ -141,10 +141,10 @@ def separated(
 def thin_out(kept: Tensor, rankings: float, generator: torch.Generator) -> Tensor:
     """Choose r rankings per training example (METHOD section 4; figure 7, left).
 
-    A ranking is a pair and a training example is a scene: every scene gives floor(r) pairs, and a share r - floor(r) of the
-    scenes one more, so that r is the mean. Below 1 only a share r of the scenes is learnt from. A scene with fewer pairs
-    gives those that it has; the others do not make up for it. With the same seed the choice for a smaller r is part of that
-    for a larger one, so that a study over r varies nothing else.
+    A ranking is a pair and a training example is a scene: every scene gives floor(r) pairs, and a share r - floor(r)
+    of the scenes one more, so that r is the mean. Below 1 only a share r of the scenes is learnt from. A scene with
+    fewer pairs gives those that it has; the others do not make up for it. With the same seed the choice for a smaller
+    r is part of that for a larger one, so that a study over r varies nothing else.
 
     Args:
         kept: ``[S, M]`` bool, pairs to choose from.
@@ -184,8 +184,8 @@ def agent_preference(agent_distance: Tensor, preferred: Tensor, unpreferred: Ten
         margin: 0 or more; an agent whose two distances differ by less, or not at all, has no say.
 
     Returns:
-        ``[S, M, A]`` int64: 1 where the agent is nearer to its log in the preferred rollout, -1 in the unpreferred one, and 0
-        where it has no say.
+        ``[S, M, A]`` int64: 1 where the agent is nearer to its log in the preferred rollout, -1 in the unpreferred
+        one, and 0 where it has no say.
 
     Raises:
         ValueError: the margin is negative, or a distance is not finite.

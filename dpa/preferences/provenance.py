@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -96,8 +96,8 @@ class Provenance:
             version = values.pop("format")
         except (OSError, RecursionError, ValueError, KeyError, TypeError) as error:
             raise StoreError(
-                f"{path} is not the metadata of a preference store ({one_line(error)}); restore it, or collect anew into "
-                "another folder."
+                f"{path} is not the metadata of a preference store ({one_line(error)}); restore it, or collect anew "
+                "into another folder."
             ) from None
         if version != FORMAT:
             raise StoreError(

@@ -17,9 +17,9 @@ from dpa.preferences.store import PreferenceStore
 class PreferenceStorage(Storage):
     """Ranked groups to sample from: read-only, and padded as :meth:`PreferenceStore.read` does.
 
-    A sample is a tensordict of batch size ``[S]``. Nothing is kept in memory but what is sampled, and with ``prefetch`` the
-    buffer's threads read and unpack the next samples while the last one is in use. Since samples are batches already, the
-    buffer's ``collate_fn`` must leave them as they are: :meth:`collate`.
+    A sample is a tensordict of batch size ``[S]``. Nothing is kept in memory but what is sampled, and with
+    ``prefetch`` the buffer's threads read and unpack the next samples while the last one is in use. Since samples are
+    batches already, the buffer's ``collate_fn`` must leave them as they are: :meth:`collate`.
 
     Args:
         store: with at least one scene.

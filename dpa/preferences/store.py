@@ -1,8 +1,8 @@
 """Ranked groups on disk: packed, append-only, checked, read one by one.
 
 A store is a folder with ``metadata.json`` (what the groups came from) and files of some scenes each
-(:mod:`dpa.preferences.chunk`). A chunk appears by one rename, complete with its checksums: whatever ends a writer, the store
-holds whole chunks only. :mod:`dpa.preferences.writer` writes.
+(:mod:`dpa.preferences.chunk`). A chunk appears by one rename, complete with its checksums: whatever ends a writer, the
+store holds whole chunks only. :mod:`dpa.preferences.writer` writes.
 """
 
 from __future__ import annotations
@@ -139,8 +139,8 @@ class PreferenceStore:
             row = int(again[0])
             first, second = (self._files[chunk].name for chunk in self._places[row : row + 2, 0])
             raise StoreError(
-                f"{self.folder}: scene {int(self.scenes[row])} is in {first} and in {second}; delete one of the two and "
-                "collect again what is then missing."
+                f"{self.folder}: scene {int(self.scenes[row])} is in {first} and in {second}; delete one of the two "
+                "and collect again what is then missing."
             )
 
 

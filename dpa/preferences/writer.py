@@ -31,13 +31,13 @@ class PreferenceWriter:
     """Appends ranked groups to a store, together with whoever else does.
 
     Groups wait in memory, packed, until ``chunk_scenes`` of them make a chunk; :meth:`close`, or the end of a ``with``
-    block, writes the rest. A chunk is written aside, synchronised and renamed, so a process that is killed loses at most
-    what waits. To resume, open the folder again with the same provenance and leave out :attr:`scenes_done`.
+    block, writes the rest. A chunk is written aside, synchronised and renamed, so a process that is killed loses at
+    most what waits. To resume, open the folder again with the same provenance and leave out :attr:`scenes_done`.
 
-    Any number of writers may append at the same time, also from several machines on a file system that they share and that
-    knows locks (``flock``). Only while a chunk is written does its writer hold the folder's lock; it then looks which scenes
-    have come in the meantime. **A scene is stored once, and the first wins**: a group follows from scene, policy, options and
-    seed, so a second one says the same.
+    Any number of writers may append at the same time, also from several machines on a file system that they share and
+    that knows locks (``flock``). Only while a chunk is written does its writer hold the folder's lock; it then looks
+    which scenes have come in the meantime. **A scene is stored once, and the first wins**: a group follows from scene,
+    policy, options and seed, so a second one says the same.
 
     Args:
         folder: of the store; made if missing.
@@ -188,8 +188,8 @@ def _acquire(lock: IO[str], folder: Path) -> None:
         except BlockingIOError:
             if time.monotonic() > end:
                 raise StoreError(
-                    f"{folder / LOCK_FILE} was held by another writer for {LOCK_SECONDS:g} s; end the writer that hangs, "
-                    "then run the same command again."
+                    f"{folder / LOCK_FILE} was held by another writer for {LOCK_SECONDS:g} s; end the writer that "
+                    "hangs, then run the same command again."
                 ) from None
         except OSError as error:
             raise StoreError(

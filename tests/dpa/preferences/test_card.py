@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from dpa.preferences.__main__ import main
 from dpa.preferences.card import annotation_seconds, mean_spearman
 from dpa.preferences.examples import example_groups, example_provenance
 from envs import keys
+from envs.scene import AgentKind
 
 
 @pytest.fixture
@@ -39,6 +41,37 @@ def test_card_of_a_hand_case(folder: Path) -> None:
     assert card.human_hours == pytest.approx(float(seconds.sum()) * 2 / 3600)
 
 
+def test_the_card_tells_classes_and_features_apart(tmp_path: Path) -> None:
+    groups = example_groups(3)
+    groups[keys.AGENT_KIND][2, 3] = AgentKind.OTHER
+    with PreferenceWriter(tmp_path, example_provenance()) as writer:
+        writer.append(groups)
+    card = data_card(PreferenceStore(tmp_path))
+    ranked = groups[keys.AGENT_RANKED]
+    for name, kind in (("vehicle", 1), ("pedestrian", 2), ("cyclist", 3), ("other", 4)):
+        rows = ranked & (groups[keys.AGENT_KIND] == kind)
+        assert card.classes[name].agents == int(rows.sum())
+        mean = groups[keys.AGENT_DISTANCE].transpose(1, 2)[rows].mean()
+        assert card.classes[name].distance == pytest.approx(float(mean))
+    shares = groups[keys.FEATURE_SHARE].mean((0, 1)).tolist()
+    assert card.feature_shares == pytest.approx({"speed": shares[0], "effort": shares[1]})
+    assert card.scene_bytes == sum(path.stat().st_size for path in tmp_path.glob("chunk-*")) / 3
+
+
+def test_a_card_without_agents_or_shares_is_a_card(tmp_path: Path) -> None:
+    groups = example_groups(1)
+    groups[keys.AGENT_RANKED].zero_()
+    groups[keys.AGENT_DISTANCE].zero_()
+    groups[keys.DISTANCE].zero_()
+    groups[keys.FEATURE_SHARE] = torch.empty(1, 8, 0)
+    with PreferenceWriter(tmp_path, example_provenance()) as writer:
+        writer.append(groups)
+    card = data_card(PreferenceStore(tmp_path))
+    assert card.agents == 0 and card.tied_scenes == 1 and card.feature_shares == {}
+    assert card.to_json()["spearman"] is None and card.to_json()["classes"]["cyclist"]["distance"] is None
+    assert "not stored" in str(card)
+
+
 def test_annotation_time_meets_the_points_of_the_paper_and_stays_beyond_the_last() -> None:
     agents = torch.tensor([1, 10, 20, 30, 40, 80, 128])
     assert annotation_seconds(agents).tolist() == pytest.approx([0.7, 4.9, 9.8, 19.6, 29.4, 42.1, 42.1])
@@ -52,18 +85,24 @@ def test_spearman_equals_scipy_with_ties() -> None:
     assert math.isnan(mean_spearman(torch.zeros(1, 4), torch.rand(1, 4)))
 
 
-def test_info_prints_card_and_origin(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["info", str(folder), "--pairs", "4"]) == 0
+def test_info_prints_card_and_origin_and_writes_them(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["info", str(folder), "--pairs", "4", "--json", str(tmp_path / "card.json")]) == 0
     printed = capsys.readouterr().out
     assert "12 (4 per scene" in printed
+    assert "distance made of     speed" in printed
     assert '"vocab_size": 169' in printed
+    card = json.loads((tmp_path / "card.json").read_text())
+    assert card["pairs"] == 4 and card["origin"]["vocab_size"] == 169 and card["classes"]["vehicle"]["agents"] == 4
 
 
 def test_verify_tells_a_sound_store_from_a_damaged_one(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["verify", str(folder)]) == 0
-    next(folder.glob("chunk-*/ade.npy")).unlink()
+    chunk = next(folder.glob("chunk-*"))
+    chunk.write_bytes(chunk.read_bytes()[:-1])
     assert main(["verify", str(folder)]) == 1
-    assert "ade.npy is missing" in capsys.readouterr().out
+    assert f"{chunk.name} is not what its name says" in capsys.readouterr().out
 
 
 def test_a_wrong_folder_or_too_many_pairs_end_with_one_clear_line(folder: Path, tmp_path: Path, capsys) -> None:

@@ -242,9 +242,9 @@ def test_groups_that_cannot_be_right_are_refused_and_nothing_is_taken(
 
 
 def test_groups_of_another_size_are_refused(tmp_path: Path) -> None:
-    with PreferenceWriter(tmp_path, example_provenance()) as writer:
-        with pytest.raises(StoreError, match="8 rollouts of 16 decisions, got 6 of 16"):
-            writer.append(example_groups(2, num_rollouts=6))
+    writer = PreferenceWriter(tmp_path, example_provenance())
+    with pytest.raises(StoreError, match="8 rollouts of 16 decisions, got 6 of 16"):
+        writer.append(example_groups(2, num_rollouts=6))
 
 
 # --- damage ---------------------------------------------------------------------------------------------------------
@@ -275,13 +275,12 @@ def test_every_byte_that_is_flipped_is_found(tmp_path: Path) -> None:
         chunk.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
         (problem,) = verify(tmp_path)
         assert chunk.name in problem and "collect again" in problem
-        try:
+        if place < 8:  # the first magic, which reading does not need
             back = PreferenceStore(tmp_path).read([0, 1], num_agents=4)
-        except StoreError as error:
-            assert chunk.name in str(error)
+            assert all(torch.equal(back[key], groups[key]) for key in groups.keys())
         else:
-            assert all(torch.equal(back[key], groups[key]) for key in groups.keys()), "only the first magic went"
-            assert place < 8
+            with pytest.raises(StoreError, match=chunk.name):
+                PreferenceStore(tmp_path)[:]
 
 
 def test_a_cut_file_is_one_error_wherever_it_is_cut(tmp_path: Path) -> None:
