@@ -87,6 +87,12 @@ def align(
         return path
     seed_everything(seed)
     candidates = make_candidates(method.data, store, scenes, context, model.tokenizer.cpu(), seed)
+    counts = {len(group.preferred) for group in candidates}
+    if len(counts) > 1 and min(counts) < options.pairs_per_scene:
+        raise ValueError(
+            f"alignment.pairs_per_scene={options.pairs_per_scene} and scenes have {min(counts)} to {max(counts)} pairs "
+            f"after method.data.margin and rankings_per_scene; say alignment.pairs_per_scene={min(counts)}."
+        )
     loss = ranks.wrap(make_loss(method.loss, model.to(device).train()))
     optimizer = make_optimizer(model, options.lr, options.weight_decay)
     schedule = make_schedule(optimizer, options.steps, options.warmup)

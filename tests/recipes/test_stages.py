@@ -265,6 +265,17 @@ def test_options_that_give_no_pairs_are_told(
         pairs_of(runs, options, **data)
 
 
+def test_a_step_asks_for_no_more_pairs_than_every_scene_has(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path
+) -> None:
+    given = (f"policy={runs / 'reference/policy.pt'}", f"preferences={runs / 'preferences'}", "method.data.num=2")
+    ragged = ("method.data.rankings_per_scene=1.5", "alignment.pairs_per_scene=2")
+    outcome = run("align", *options("align", *given, *ragged, f"output={tmp_path / 'out'}"))
+    assert outcome.status == 2
+    assert "scenes have 1 to 2 pairs after method.data.margin" in outcome.err
+    assert "say alignment.pairs_per_scene=1" in outcome.err
+
+
 # --- align ----------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_aligns_the_reference(
