@@ -97,10 +97,9 @@ class PreferenceWriter:
         Raises:
             StoreError: a value does not fit the store; nothing of ``groups`` is taken.
         """
-        known = self._stored | self._waiting.keys()
-        new = {}
+        new: dict[int, PackedGroup] = {}
         for group in self._checked(groups):
-            if group.scene not in known and group.scene not in new:
+            if not any(group.scene in known for known in (self._stored, self._waiting, new)):
                 new[group.scene] = PackedGroup(
                     group.scene,
                     len(group.tokens),
