@@ -7,6 +7,7 @@ import multiprocessing
 import random
 import signal
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -97,27 +98,40 @@ def collect_here(arguments: list[str]) -> None:
     collect_main()
 
 
-def test_a_collection_killed_at_fifty_random_moments(options: Callable, runs: Path, tmp_path: Path) -> None:
+def test_a_collection_killed_at_fifty_random_moments(run: Callable, options: Callable, tmp_path: Path) -> None:
     """Started again after each kill; a store that is full before there were enough kills is begun anew."""
-    processes = multiprocessing.get_context("forkserver")
-    processes.set_forkserver_preload(["recipes.collect"])
-    draw, kills, folder, found = random.Random(0), 0, tmp_path / "0", set()
-    while kills < 50:
-        arguments = [*command("collect", options, runs, folder), "collection.chunk_scenes=1"]
-        process = processes.Process(target=collect_here, args=(arguments,), daemon=True)
+
+    def collecting(folder: Path, seconds: float | None = None) -> bool:
+        """Collect into a folder, killed after some time; whether that came before the end."""
+        given = (f"policy={tmp_path / 'pretrain/policy.pt'}", f"output={folder}", "collection.chunk_scenes=1")
+        process = processes.Process(target=collect_here, args=(options("collect", *given),), daemon=True)
         process.start()
-        process.join(draw.uniform(0.5, 4.0))
+        process.join(seconds)
         process.kill()
         process.join()
-        kills += process.exitcode == -signal.SIGKILL
-        if not (folder / "collect" / "metadata.json").exists():
+        return process.exitcode == -signal.SIGKILL
+
+    assert run("pretrain", *options("pretrain", f"output={tmp_path / 'pretrain'}")).status == 0
+    processes = multiprocessing.get_context("forkserver")
+    processes.set_forkserver_preload(["recipes.collect"])
+    collecting(tmp_path / "warm")
+    start = time.monotonic()
+    assert not collecting(tmp_path / "whole")
+    usual = time.monotonic() - start
+    draw, kills, folder, found = random.Random(0), 0, tmp_path / "0", set()
+    while kills < 50:
+        kills += collecting(folder, draw.uniform(0, 1.2 * usual))
+        if not (folder / "metadata.json").exists():
             continue
-        store = PreferenceStore(folder / "collect")
+        assert verify(folder) == []
+        store = PreferenceStore(folder)
         found.add(len(store))
         if len(store) == 6:
-            assert_same_preferences(folder / "collect", runs / "collect")
+            assert_same_preferences(folder, tmp_path / "whole")
             folder = tmp_path / str(kills)
     assert len(found) > 2, "kills came at different moments"
+    assert not collecting(folder)
+    assert_same_preferences(folder, tmp_path / "whole")
 
 
 def test_killed_evaluation(run: Callable, options: Callable, kill_when: Callable, runs: Path, tmp_path: Path) -> None:
