@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy.stats import rankdata
 from torch import Tensor
 
 from dpa.preferences.pairs import nearest_farthest
 from dpa.preferences.provenance import Provenance
 from dpa.preferences.store import PreferenceStore
+from dpa.ranking.agreement import rank_correlation
 from envs.scene import AgentKind
 
 ANNOTATION_AGENTS = (1, 10, 20, 40, 80)
@@ -144,7 +144,7 @@ def data_card(store: PreferenceStore, pairs: int | None = None) -> DataCard:
         tied_pairs=float((margin == 0).float().mean()),
         margin=float(margin.mean()),
         relative_margin=float((margin / scale).mean()),
-        spearman=mean_spearman(distance, content.ade),
+        spearman=_mean_correlation(distance, content.ade),
         human_hours=float(annotation_seconds(content.agents).sum()) * pairs / 3600,
         scene_bytes=store.num_bytes / len(store),
         origin=store.provenance,
@@ -212,22 +212,7 @@ def annotation_seconds(agents: Tensor) -> Tensor:
     return torch.from_numpy(np.interp(agents.numpy(), ANNOTATION_AGENTS, ANNOTATION_SECONDS))
 
 
-def mean_spearman(first: Tensor, second: Tensor) -> float:
-    """Mean over scenes of the rank correlation of two measures of the same rollouts.
-
-    Args:
-        first: ``[S, K]``.
-        second: ``[S, K]``.
-
-    Returns:
-        between -1 and 1, ties at their mean rank; nan when in every scene one of the two is constant.
-
-    Examples:
-        >>> round(mean_spearman(torch.tensor([[1.0, 2, 3], [5, 5, 5]]), torch.tensor([[4.0, 6, 5], [1, 2, 3]])), 3)
-        0.5
-    """
-    ranks = np.stack([rankdata(value.numpy(), axis=1) for value in (first, second)])
-    ranks -= ranks.mean(-1, keepdims=True)
-    norm = np.linalg.norm(ranks, axis=-1).prod(0)
-    vary = norm > 0
-    return float((ranks.prod(0).sum(-1)[vary] / norm[vary]).mean()) if vary.any() else float("nan")
+def _mean_correlation(first: Tensor, second: Tensor) -> float:
+    """Mean of the rank correlation over the scenes that have one; nan if none has."""
+    found = rank_correlation(first, second)
+    return float(np.nanmean(found)) if not np.isnan(found).all() else float("nan")

@@ -94,43 +94,21 @@ def couple_agent(distance: PreferenceDistance, scene: Scene, trajectory: Tensor,
     if not valid.any():
         raise ValueError(f"agent {agent} of scene {scene.scene_id} has no valid step in the log; choose another agent.")
     sides = (rollout, log, valid, valid, weights)
-    moved = transport_cost(*sides, method=distance.method, coupling=True)
+    step = stride * STEP_SECONDS
+    moved = transport_cost(*sides, method=distance.method, coupling=True, step=step, **distance.solver)
     cost = (weights.double() * (rollout[:, None].double() - log.double()) ** 2).sum(-1).sqrt()
     return AgentCoupling(
         names=names,
-        seconds=STEP_SECONDS * stride * torch.arange(1, len(valid) + 1),
+        seconds=step * torch.arange(1, len(valid) + 1),
         valid=valid,
         rollout=rollout,
         log=log,
         cost=torch.where(valid[:, None] & valid, cost, torch.nan),
         coupling=moved.coupling,
-        parts=feature_parts(rollout, log, moved.coupling, weights),
+        parts=moved.parts,
         distance=float(moved.distance),
         time_aligned=float(transport_cost(*sides, method="time_aligned").distance),
     )
-
-
-def feature_parts(x: Tensor, y: Tensor, coupling: Tensor, weights: Tensor) -> Tensor:
-    """Part of each feature in a distance: of the cost ``c`` of a pair of steps, ``w_k d_k^2 / c`` is the feature's.
-
-    Args:
-        x: ``[T, D]``.
-        y: ``[T', D]``.
-        coupling: ``[T, T']``.
-        weights: ``[D]``.
-
-    Returns:
-        ``[D]``, summing to the distance.
-
-    Examples:
-        >>> x, y = torch.tensor([[0.0, 0.0]]), torch.tensor([[3.0, 4.0]])
-        >>> feature_parts(x, y, torch.ones(1, 1), torch.ones(2))  # of a distance of 5
-        tensor([1.8000, 3.2000])
-    """
-    paid = weights.double() * (x[:, None].double() - y.double()) ** 2
-    cost = paid.sum(-1, keepdim=True).sqrt()
-    share = torch.where(cost > 0, paid / cost, 0.0)
-    return (coupling[..., None].double() * share).sum((0, 1)).float()
 
 
 def plot_coupling(

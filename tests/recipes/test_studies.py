@@ -126,7 +126,7 @@ def test_a_finished_study_is_read_back_and_a_killed_one_goes_on(
     [
         ("validity", ["window=9"], "window must be 1 to num_rollouts"),
         ("validity", ["policies=[]"], "policies=.. names no policy"),
-        ("validity", ["+rankings.bad={method: teleport}"], "unknown method 'teleport'"),
+        ("validity", ["+rankings.bad={method: teleport}"], "unknown transport method 'teleport'"),
         ("sensitivity", ["baseline=none"], "baseline must be one of the rankings paper"),
         ("sensitivity", ["num_rollouts=4"], "num_rollouts must be 8 or more, got 4"),
     ],

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 
 import pytest
 import torch
-from scipy.stats import spearmanr
 
 from dpa.preferences import PreferenceStore, PreferenceWriter, data_card
 from dpa.preferences.__main__ import main
-from dpa.preferences.card import annotation_seconds, mean_spearman
+from dpa.preferences.card import annotation_seconds
 from dpa.preferences.examples import example_groups, example_provenance
 from envs import keys
 from envs.scene import AgentKind
@@ -75,14 +73,6 @@ def test_a_card_without_agents_or_shares_is_a_card(tmp_path: Path) -> None:
 def test_annotation_time_meets_the_points_of_the_paper_and_stays_beyond_the_last() -> None:
     agents = torch.tensor([1, 10, 20, 30, 40, 80, 128])
     assert annotation_seconds(agents).tolist() == pytest.approx([0.7, 4.9, 9.8, 19.6, 29.4, 42.1, 42.1])
-
-
-def test_spearman_equals_scipy_with_ties() -> None:
-    rng = torch.Generator().manual_seed(0)
-    first, second = (torch.randint(0, 5, (6, 10), generator=rng).float() for _ in range(2))
-    want = sum(spearmanr(a, b).statistic for a, b in zip(first, second, strict=True)) / 6
-    assert mean_spearman(first, second) == pytest.approx(want)
-    assert math.isnan(mean_spearman(torch.zeros(1, 4), torch.rand(1, 4)))
 
 
 def test_info_prints_card_and_origin_and_writes_them(

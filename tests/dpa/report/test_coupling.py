@@ -8,15 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from matplotlib.colors import to_rgba
 from PIL import Image
 from torch import Tensor
 
-from dpa.ranking import FEATURE_SETS, FEATURES, PreferenceDistance, log_trajectory, transport_cost
+from dpa.ranking import FEATURE_SETS, FEATURES, PreferenceDistance, log_trajectory
 from dpa.report import coupling
-from dpa.report.coupling import AgentCoupling, agent_name, couple_agent, coupled_values, feature_parts, plot_coupling
+from dpa.report.coupling import AgentCoupling, agent_name, couple_agent, coupled_values, plot_coupling
 from envs.scene import Scene
 from envs.sources.synthetic import straight_road
 
@@ -95,29 +93,6 @@ def test_an_agent_that_the_log_loses_at_once_is_refused(scene: Scene, braking: T
     scene.agents.valid[1, 11:] = False
     with pytest.raises(ValueError, match=r"agent 1 of scene .* has no valid step in the log; choose another agent"):
         couple_agent(COARSE, scene, braking, 1)
-
-
-vectors = st.lists(
-    st.tuples(*[st.floats(-20, 20, width=32)] * 3, *[st.floats(-20, 20, width=32)] * 3), min_size=1, max_size=6
-)
-
-
-@given(vectors, st.tuples(*[st.floats(0, 10, width=32)] * 3))
-def test_parts_are_not_negative_and_sum_to_the_distance(
-    rows: list[tuple[float, ...]], weights: tuple[float, ...]
-) -> None:
-    x, y = torch.tensor(rows).split(3, 1)
-    always = torch.ones(len(rows), dtype=torch.bool)
-    moved = transport_cost(x, y, always, always, torch.tensor(weights), coupling=True)
-    parts = feature_parts(x, y, moved.coupling, torch.tensor(weights))
-    assert (parts >= 0).all()
-    torch.testing.assert_close(parts.sum(), moved.distance, rtol=1e-4, atol=1e-5)
-
-
-def test_a_feature_without_weight_has_no_part() -> None:
-    x, y = torch.tensor([[1.0, 5.0], [2.0, 7.0]]), torch.zeros(2, 2)
-    parts = feature_parts(x, y, torch.eye(2) / 2, torch.tensor([1.0, 0.0]))
-    assert parts.tolist() == [1.5, 0.0]
 
 
 def test_a_step_of_the_log_that_two_steps_share_is_weighed_by_mass() -> None:
