@@ -20,7 +20,6 @@ from torchrl.objectives import LossModule
 
 from dpa.losses import ContrastivePreferenceLoss, NextTokenLoss, token_network
 from dpa.policy import MotionLM
-from dpa.preferences import PreferenceStore
 from dpa.report.figures import read_curves
 from dpa.training.batches import Item, ShuffledOrder, collate_items, micro_batches
 from dpa.training.distributed import ALONE, Ranks, join_ranks
@@ -33,7 +32,8 @@ from envs.store import SceneStore
 from recipes.candidates import Group, make_candidates
 from recipes.cli import CONFIG, build, check_steps, finished, finite, plain, ranked_recipe, write_json
 from recipes.models import open_policy, weights_digest, write_policy
-from recipes.scenes import fingerprint, open_splits
+from recipes.rankings import open_preferences
+from recipes.scenes import open_splits
 
 LOSSES: dict[str, type[LossModule]] = {"contrastive": ContrastivePreferenceLoss, "next_token": NextTokenLoss}
 """Losses that a method's YAML can name."""
@@ -71,11 +71,7 @@ def align(
     ranks.share_of(options.scenes_per_step, "alignment.scenes_per_step")
     device = ranks.place(cfg.device)
     model, context, config = open_policy(policy, device)
-    store = PreferenceStore(preferences)
-    if store.provenance.scenes != fingerprint(scenes):
-        raise ValueError(f"{preferences} ranks rollouts of other scenes; collect again with the scenes at hand.")
-    if store.provenance.policy != weights_digest(model):
-        raise ValueError(f"{preferences} ranks rollouts of another policy; collect again with {policy}.")
+    store = open_preferences(preferences, scenes, model, policy)
     decided_by = {
         "method": plain(method),
         "alignment": plain(options),

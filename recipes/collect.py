@@ -19,7 +19,6 @@ from omegaconf import DictConfig
 from dpa.policy import Decoding
 from dpa.policy.actor import check_precision
 from dpa.preferences import PreferenceStore, PreferenceWriter, Provenance, data_card
-from dpa.ranking import PreferenceDistance
 from dpa.ranking.transform import RankRollouts
 from dpa.rollout import Workers, make_collector
 from dpa.rollout.collector import rows_within
@@ -27,6 +26,7 @@ from envs.progress import progress
 from envs.store import SceneStore
 from recipes.cli import CONFIG, build, plain, recipe, write_json
 from recipes.models import open_policy, weights_digest
+from recipes.rankings import build_distance
 from recipes.scenes import fingerprint, open_splits
 
 
@@ -51,12 +51,14 @@ def collect(
     indices = range(len(scenes)) if indices is None else indices
     options = cfg.collection
     model, context, _ = open_policy(policy, cfg.device)
-    distance = build(PreferenceDistance, options.ranking, "collection.ranking")
+    distance = build_distance(options.ranking, "collection.ranking")
     # What is wrong with an option is told before a store is begun with it.
     decoding = build(Decoding, options.decoding, "collection.decoding")
     workers = build(Workers, options.workers, "collection.workers")
     check_precision(options.precision)
     rows_within(options.memory, model, context)
+    if options.num_rollouts < 1:
+        raise ValueError(f"collection.num_rollouts must be 1 or more, got {options.num_rollouts}.")
     provenance = Provenance(
         policy=weights_digest(model),
         scenes=fingerprint(scenes),

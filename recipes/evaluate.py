@@ -16,16 +16,17 @@ import torch
 from omegaconf import DictConfig
 
 from dpa.policy import Decoding
-from dpa.ranking import PreferenceDistance
+from dpa.ranking import Distance
 from dpa.realism import RealismResult, mean_result, realism
 from dpa.realism.submission import SubmissionWriter, plan_submission
 from dpa.rollout import make_collector
 from envs.progress import progress
 from envs.scene import CURRENT_STEP
 from envs.store import SceneStore
-from recipes.cli import CONFIG, build, finished, finite, plain, recipe, write_json
+from recipes.cli import CONFIG, finished, finite, plain, recipe, write_json
 from recipes.models import open_policy, weights_digest
 from recipes.partial import PartialResult
+from recipes.rankings import build_distance
 from recipes.rolled import Rolled, rolled
 from recipes.scenes import fingerprint, open_splits
 
@@ -83,7 +84,7 @@ def evaluate(
     submission = None if open_submission is None else open_submission(scenes.scene_ids, decided_by)
     if done is not None and (submission is None or submission.finished):
         return done
-    distance = build(PreferenceDistance, cfg.collection.ranking, "collection.ranking")
+    distance = build_distance(cfg.collection.ranking, "collection.ranking")
     partial = PartialResult(path, decided_by)
     scored = partial.read()
     # A scene is done once it is scored and, where a submission is written, in there as well.
@@ -115,7 +116,7 @@ def evaluate(
     return content
 
 
-def score_scene(each: Rolled, distance: PreferenceDistance, metric: str) -> dict[str, Any]:
+def score_scene(each: Rolled, distance: Distance, metric: str) -> dict[str, Any]:
     """The :class:`~dpa.realism.RealismResult` of one scene's rollouts as plain numbers, and figures of our own.
 
     Args:

@@ -27,8 +27,9 @@ from envs import keys
 from envs.scene import Scene
 from envs.store import SceneStore
 from recipes.cli import CONFIG, build, recipe
-from recipes.models import open_policy, weights_digest
-from recipes.scenes import fingerprint, open_splits
+from recipes.models import open_policy
+from recipes.rankings import open_preferences
+from recipes.scenes import open_splits
 
 FIGURES = ("coupling", "rollouts")
 TOLERANCE = 0.01
@@ -65,13 +66,7 @@ def open_ranked(policy: Path, preferences: Path, scenes: SceneStore, name: str) 
         ValueError: preferences of other scenes or of another policy, or without this scene.
     """
     model, options, _ = open_policy(policy)
-    store = PreferenceStore(preferences)
-    if store.provenance.scenes != fingerprint(scenes):
-        raise ValueError(
-            f"{preferences} ranks rollouts of other scenes; give the scenes and the split that it was collected with."
-        )
-    if store.provenance.policy != weights_digest(model):
-        raise ValueError(f"{preferences} ranks rollouts of another policy than {policy}; give the one that made them.")
+    store = open_preferences(preferences, scenes, model, policy)
     index = scenes.find(name)
     rows = (store.scenes == index).nonzero()[:, 0].tolist()
     if not rows:
@@ -98,6 +93,8 @@ def distance_of(store: PreferenceStore) -> PreferenceDistance:
         ValueError: it has features or options that this program does not have.
     """
     options: dict[str, Any] = dict(store.provenance.ranking)
+    if options.pop("kind", "preference") != "preference":
+        raise ValueError(f"{store.folder} was ranked by displacement, which couples nothing; look at another store.")
     unknown = sorted(set(options["weights"]) - set(FEATURES))
     if unknown:
         raise ValueError(

@@ -20,7 +20,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
-from dpa.ranking import PreferenceDistance
+from dpa.ranking import Distance
 from dpa.ranking.agreement import rank_correlation, same_order
 from dpa.report.statistics import Interval, summary
 from dpa.report.studies import plot_sensitivity
@@ -36,7 +36,7 @@ SMALLEST_GROUP = 8
 """Rollouts of the smallest group whose pairs are looked at."""
 
 
-def measure_scene(each: Rolled, distances: dict[str, PreferenceDistance]) -> dict[str, Any]:
+def measure_scene(each: Rolled, distances: dict[str, Distance]) -> dict[str, Any]:
     """Distance of every rollout by every variant, and the processor's time for it [s]."""
     found: dict[str, Any] = {"distance": {}, "seconds": {}}
     for name, distance in distances.items():

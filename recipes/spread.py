@@ -26,8 +26,9 @@ from dpa.rollout import lifted
 from envs.progress import progress
 from envs.scene import Scene, SceneSource
 from recipes.cli import CONFIG, recipe, write_json
-from recipes.models import open_policy, weights_digest
-from recipes.scenes import fingerprint, open_splits
+from recipes.models import open_policy
+from recipes.rankings import open_preferences
+from recipes.scenes import open_splits
 
 
 class Spread(NamedTuple):
@@ -92,23 +93,6 @@ def stored_rollouts(
         yield scene, lifted(scene, model.tokenizer.decode_tracks(tokens, recent, kind))
 
 
-def check_provenance(store: PreferenceStore, model: MotionLM, scenes: SceneSource) -> None:
-    """Refuse rollouts of another policy or of other scenes, whose tokens would mean nothing here.
-
-    Raises:
-        ValueError: they are.
-    """
-    for what, stored, here in (
-        ("policy", store.provenance.policy, weights_digest(model)),
-        ("scenes", store.provenance.scenes, fingerprint(scenes)),
-    ):
-        if stored != here:
-            raise ValueError(
-                f"the rollouts of preferences={store.folder} have another {what} ({stored}, here {here}); name those "
-                f"of this {what}, or collect them."
-            )
-
-
 @hydra.main(**CONFIG, config_name="spread")
 @recipe
 def main(cfg: DictConfig) -> None:
@@ -116,8 +100,7 @@ def main(cfg: DictConfig) -> None:
     names = feature_names(cfg.features if isinstance(cfg.features, str) else list(cfg.features))
     scenes = open_splits(cfg.scenes)[cfg.split]
     model, options, _ = open_policy(cfg.policy)
-    store = PreferenceStore(cfg.preferences)
-    check_provenance(store, model, scenes)
+    store = open_preferences(cfg.preferences, scenes, model, cfg.policy)
     rows = spreads(stored_rollouts(store, scenes, model, options), names)
     table = Table(title=f"{len(store)} scenes, {store.provenance.num_rollouts} rollouts each", title_justify="left")
     for title in ("feature", "unit", "weight", "spread", "share, paper", "share, normalised"):

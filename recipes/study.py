@@ -10,7 +10,7 @@ import numpy as np
 from omegaconf import DictConfig
 
 from dpa.policy import Decoding
-from dpa.ranking import PreferenceDistance
+from dpa.ranking import Distance
 from dpa.report.statistics import Interval, summary
 from dpa.rollout import make_collector
 from envs.progress import progress
@@ -19,6 +19,7 @@ from recipes.cli import build, finished, plain, write_json
 from recipes.models import open_policy, weights_digest
 from recipes.partial import PartialResult
 from recipes.play import named
+from recipes.rankings import build_distance
 from recipes.rolled import Rolled, rolled
 from recipes.scenes import fingerprint
 
@@ -87,13 +88,13 @@ def _measured(
     return per_scene
 
 
-def distances_of(section: DictConfig, name: str) -> dict[str, PreferenceDistance]:
+def distances_of(section: DictConfig, name: str) -> dict[str, Distance]:
     """Distances by name, from a section of the configuration that holds the options of each.
 
     Raises:
         ValueError: a wrong option; the message names it.
     """
-    return {key: build(PreferenceDistance, options, f"{name}.{key}") for key, options in section.items()}
+    return {key: build_distance(options, f"{name}.{key}") for key, options in section.items()}
 
 
 def over_scenes(values: np.ndarray, name: str) -> Interval:

@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from dpa.ranking import PreferenceDistance
+from dpa.ranking import Distance
 from dpa.ranking.agreement import rank_correlation
 from dpa.ranking.distance import rank_of
 from dpa.realism import realism_of_groups
@@ -55,7 +55,7 @@ def windows(distance: Tensor, size: int, stride: int) -> list[Tensor]:
 
 
 def measure_scene(
-    each: Rolled, distances: dict[str, PreferenceDistance], window: int, stride: int, metric: str, seed: int
+    each: Rolled, distances: dict[str, Distance], window: int, stride: int, metric: str, seed: int
 ) -> dict[str, Any]:
     """Mean distance and realism of every window of every ranking, and of random groups.
 

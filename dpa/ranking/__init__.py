@@ -7,6 +7,7 @@
 from dpa.ranking.displacement import Displacement, average_displacement, final_displacement
 from dpa.ranking.distance import AGGREGATES, Distance, PreferenceDistance, Ranking, rank_of
 from dpa.ranking.features import FEATURE_SETS, FEATURES, Feature, Motion, log_trajectory, occupancy_features, register
+from dpa.ranking.rival import DisplacementDistance
 from dpa.ranking.transport import SOLVERS, Dense, Pairs, Problems, Transport, transport_cost
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "SOLVERS",
     "Dense",
     "Displacement",
+    "DisplacementDistance",
     "Distance",
     "Feature",
     "Motion",

@@ -63,6 +63,9 @@ class Distance(Protocol):
             the ranking; D is the same for all scenes and may be 0.
         """
 
+    def describe(self) -> dict[str, Any]:
+        """What decides a ranking, ready for JSON; a preference store keeps it. Only recipes ask for it."""
+
 
 def rank_of(distance: Tensor) -> Tensor:
     """Rank of each rollout, 0 for the nearest; ties go to the smaller index.
@@ -133,6 +136,7 @@ class PreferenceDistance:
         """The options that decide a ranking, with defaults filled in, ready for JSON."""
         names = feature_names(self.features)
         return {
+            "kind": "preference",
             "weights": dict(zip(names, feature_weights(names, self.weights).tolist(), strict=True)),
             "clips": {name: list(clip) for name, clip in feature_clips(names, self.clips).items()},
             "stride": self.stride,
@@ -151,7 +155,7 @@ class PreferenceDistance:
                 order.
             controlled: ``[A]`` bool; all of them by default.
         """
-        ego = self._ego(scene, controlled)
+        ego = ranked_agents(scene, controlled, self.agents)
         phi, log_phi, valid = self._features(scene, trajectories, ego)
         weights = feature_weights(feature_names(self.features), self.weights)
         moved = transport_cost(
@@ -180,19 +184,25 @@ class PreferenceDistance:
         distance = AGGREGATES[self.aggregate](agent_distance[:, ego])
         return Ranking(distance, agent_distance, ade, agent_ranked, _shares(moved.parts))
 
-    def _ego(self, scene: Scene, controlled: Tensor | None) -> Tensor:
-        """``[E]`` int64: rows of the agents that may be ranked."""
-        present = scene.agents.present
-        if controlled is None:
-            controlled = torch.ones(int(present.sum()), dtype=torch.bool)
-        chosen = controlled & scene.agents.evaluated[present] if self.agents == "evaluated" else controlled
-        return chosen.nonzero()[:, 0]
-
     def _features(self, scene: Scene, trajectories: Tensor, ego: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Features of the rollouts ``[R, E, T', D]``, of the log ``[1, E, T', D]``, and valid ``[E, T']``."""
         both = torch.cat((trajectories, log_trajectory(scene, trajectories.shape[2])[None].to(trajectories)))
         phi, valid = occupancy_features(scene, both, self.features, ego=ego, stride=self.stride, clips=self.clips)
         return phi[:-1], phi[-1:], valid
+
+
+def ranked_agents(scene: Scene, controlled: Tensor | None, agents: str) -> Tensor:
+    """Rows of the agents that may be ranked, ``[E]`` int64.
+
+    Args:
+        scene: an uncollated scene.
+        controlled: ``[A]`` bool of the present agents; all of them where it is None.
+        agents: ``"controlled"``, or ``"evaluated"``: of these only the SDC and the tracks to predict.
+    """
+    present = scene.agents.present
+    if controlled is None:
+        controlled = torch.ones(int(present.sum()), dtype=torch.bool)
+    return (controlled & scene.agents.evaluated[present] if agents == "evaluated" else controlled).nonzero()[:, 0]
 
 
 def _shares(parts: Tensor) -> Tensor:

@@ -128,7 +128,7 @@ def test_preferences_of_other_scenes_are_refused(
         f"output={tmp_path / 'out'}",
         f"scenes.train={stores / 'other'}",
     )
-    assert_refused(run("align", *command), "preferences ranks rollouts of other scenes; collect again")
+    assert_refused(run("align", *command), "preferences ranks rollouts of other scenes; give the scenes and the split")
 
 
 def test_preferences_of_another_policy_are_refused(

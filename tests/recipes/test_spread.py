@@ -46,7 +46,7 @@ def test_rollouts_of_another_policy_are_refused(run: Callable, options: Callable
     given = (f"policy={runs / '1/policy.pt'}", f"preferences={runs / 'preferences'}")
     outcome = run("spread", *options("spread", *given))
     assert outcome.status == 2
-    assert "have another policy" in outcome.err
+    assert "ranks rollouts of another policy than" in outcome.err
 
 
 def test_only_valid_agent_steps_count_and_shares_follow_the_weights() -> None:

@@ -181,6 +181,8 @@ def test_workers_fill_the_same_store_byte_for_byte(
         ("collection.workers.count=2", "2 workers need backend=process or backend=ray"),
         ("collection.memory=0", "memory must hold at least one agent, got 0 GiB"),
         ("collection.precision=float16", "precision must be one of float32, bfloat16, got 'float16'"),
+        ("collection.num_rollouts=-1", "collection.num_rollouts must be 1 or more, got -1"),
+        ("collection.ranking.kind=taste", "collection.ranking.kind must be one of .*, got 'taste'"),
         ("collection.decoding.top_k=-1", "top_k must be 0 .all tokens. or more, got -1"),
     ],
 )
@@ -190,6 +192,16 @@ def test_a_wrong_option_is_told_before_a_store_is_begun(
     outcome = run("collect", *collect_into(tmp_path / "preferences", runs, options), option)
     assert outcome.status == 2 and re.search(message, outcome.err)
     assert not (tmp_path / "preferences").exists()
+
+
+def test_rollouts_can_be_ranked_by_displacement(run: Callable, options: Callable, runs: Path, tmp_path: Path) -> None:
+    command = [o for o in collect_into(tmp_path / "preferences", runs, options) if "ranking.stride" not in o]
+    outcome = run("collect", *command, "ranking@collection.ranking=displacement")
+    assert outcome.status == 0, outcome.err
+    store, other = (PreferenceStore(folder) for folder in (tmp_path / "preferences", runs / "preferences"))
+    assert store.provenance.ranking["kind"] == "displacement"
+    torch.testing.assert_close(store[:][keys.DISTANCE], store[:][keys.ADE])
+    torch.testing.assert_close(store[:][keys.ADE], other[:][keys.ADE])
 
 
 def test_collecting_again_adds_nothing(run: Callable, options: Callable, runs: Path) -> None:
