@@ -22,8 +22,8 @@ from rich.table import Table
 
 from recipes.cli import write_json
 
-STEPS, DECISIONS = 80, 16
-"""Of an episode: steps of 0.1 s and decisions of 0.5 s."""
+STEPS = 80
+"""Of an episode, of 0.1 s."""
 SCORED_ROLLOUTS = 32
 """Of each scene in an evaluation (the WOSAC standard)."""
 
@@ -64,6 +64,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--alignment-steps", type=int, default=200_000, help="updates")
     parser.add_argument("--alignment-pairs", type=int, default=32, help="pairs of an update, all its scenes together")
     parser.add_argument("--scene-kb", type=float, default=98.4, help="of a stored scene")
+    parser.add_argument("--track-bytes", type=float, default=3.2, help="of an agent's stored and ranked rollout")
     parser.add_argument("--convert-rate", type=float, default=1_718, help="scenes a minute and worker")
     parser.add_argument("--metric-seconds", type=float, default=0.2, help="of the realism metric, a scene")
     parser.add_argument("--json", type=Path, metavar="OUT", help="write the plan here too")
@@ -99,7 +100,6 @@ def make_plan(rates: dict[str, float], memory: dict[str, float], options: argpar
     def hours(rollouts: float, rate: str) -> float:
         return rollouts * options.agents * STEPS / rates[rate] / options.workers / 3600
 
-    each = options.rollouts * options.agents * (DECISIONS + 4) + 8 * options.rollouts  # tokens, distances
     evaluated = hours(options.eval_scenes * SCORED_ROLLOUTS, "collector")
     evaluated += options.eval_scenes * options.metric_seconds / options.workers / 3600
     trained = options.pretraining_steps * options.pretraining_batch
@@ -110,7 +110,7 @@ def make_plan(rates: dict[str, float], memory: dict[str, float], options: argpar
         Part(
             "collect and rank",
             hours(options.scenes * options.rollouts, "ranked"),
-            options.scenes * each / 1e9,
+            options.scenes * options.rollouts * options.agents * options.track_bytes / 1e9,
             memory["ranked"],
             "scenes x rollouts x agents",
         ),
