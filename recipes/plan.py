@@ -140,7 +140,7 @@ def read_rates(path: Path) -> tuple[dict[str, float], dict[str, float], dict[str
         missing = {"ranked", "collector", "trained"} - rates.keys()
     except FileNotFoundError as error:
         raise ValueError(
-            f"{path} does not exist; write it with `python -m recipes.benchmark rollout --json`."
+            f"{path} does not exist; `python -m recipes.benchmark rollout --json rollout.json` writes one."
         ) from error
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path} is no JSON of `python -m recipes.benchmark rollout` ({error!r}).") from error

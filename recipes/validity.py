@@ -124,15 +124,27 @@ def summarise(measured: dict[str, list[dict]]) -> dict[str, dict[str, Any]]:
     return found
 
 
-def against_ade(measured: dict[str, list[dict]]) -> dict[str, Interval]:
-    """Realism of the nearest window of each ranking minus that of the ADE's, scene by scene."""
+def compare_with(measured: dict[str, list[dict]], other: str) -> dict[str, dict[str, Interval]]:
+    """Realism of the ``nearest`` and the ``farthest`` window of each ranking minus another's, scene by scene.
+
+    Raises:
+        ValueError: no such ranking, or no scene has realism.
+    """
     rows = _with_realism(measured)
+    names = [name for name in rows[0][0] if name != "random"]
+    if other not in names:
+        raise ValueError(f"against must be one of {', '.join(names)}, got {other!r}.")
 
-    def nearest(name: str) -> np.ndarray:
-        return np.array([[scene[name]["realism"][0] for scene in row] for row in rows])
+    def realism_at(name: str, place: int) -> np.ndarray:
+        return np.array([[scene[name]["realism"][place] for scene in row] for row in rows])
 
-    names = [name for name in rows[0][0] if name not in ("random", ADE)]
-    return {name: paired_bootstrap(nearest(name), nearest(ADE)) for name in names}
+    def minus_other(name: str, place: int) -> Interval:
+        return paired_bootstrap(realism_at(name, place), realism_at(other, place))
+
+    places = {"nearest": 0, "farthest": -1}
+    return {
+        name: {title: minus_other(name, place) for title, place in places.items()} for name in names if name != other
+    }
 
 
 def _with_realism(measured: dict[str, list[dict]]) -> list[list[dict]]:
@@ -160,24 +172,29 @@ def main(cfg: DictConfig) -> None:
     options = {key: plain(cfg)[key] for key in ("window", "stride", "metric")}
     decided_by = options | {"rankings": {name: distance.describe() for name, distance in distances.items()}}
     measured = study(cfg, scenes, lambda each: measure_scene(each, distances, seed=cfg.seed, **options), decided_by)
-    found, paired = summarise(measured), against_ade(measured)
+    found, paired = summarise(measured), compare_with(measured, cfg.against)
     folder = Path(cfg.output)
     plot_validity(found, folder / "validity.png")
-    write_json(folder / "summary.json", {"rankings": as_json(found), "nearest_minus_ade": as_json(paired)})
+    write_json(
+        folder / "summary.json", {"rankings": as_json(found), "minus": cfg.against, "differences": as_json(paired)}
+    )
     _print(found, paired, len(scenes), len(measured), cfg)
     print(f"numbers of every scene, summary and figure: {folder}")
 
 
-def _print(found: dict, paired: dict[str, Interval], num_scenes: int, num_policies: int, cfg: DictConfig) -> None:
-    columns = ("correlation", "near_half", "nearest", "farthest")
+def _print(
+    found: dict, paired: dict[str, dict[str, Interval]], num_scenes: int, num_policies: int, cfg: DictConfig
+) -> None:
     titles = ("Spearman of distance and realism", "nearer half", "nearest window", "farthest window")
-    table = Table(
-        "ranking", *titles, "nearest minus ADE's", title=f"{num_scenes} scenes, {num_policies} policies, {cfg.metric}"
-    )
+    table = Table("ranking", *titles, title=f"{num_scenes} scenes, {num_policies} policies, {cfg.metric}")
     for name, values in found.items():
-        last = shown(paired[name]) if name in paired else "–"
-        table.add_row(name, *(shown(values[column]) for column in columns), last)
-    Console(width=160).print(table)
+        columns = ("correlation", "near_half", "nearest", "farthest")
+        table.add_row(name, *(shown(values[column]) for column in columns))
+    pairs = Table("ranking", "nearest window", "farthest window", title=f"realism minus that of {cfg.against!r}")
+    for name, values in paired.items():
+        pairs.add_row(name, *map(shown, values.values()))
+    for each in (table, pairs):
+        Console(width=140).print(each)
     print(
         f"windows of {cfg.window} of {cfg.num_rollouts} rollouts; realism minus that of {RANDOM_GROUPS} random groups; "
         "95 % intervals"

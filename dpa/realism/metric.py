@@ -9,27 +9,15 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dpa.realism.config import BUCKETS, Differences, RealismConfig
-from dpa.realism.estimators import indicator_log_likelihood, log_likelihood
+from dpa.realism.config import BUCKETS, RealismConfig
 from dpa.realism.features import Features, measure
-from dpa.realism.quirks import Quirk
+from dpa.realism.likelihood import continuous_likelihoods, event_rates, indicator_likelihoods
 from dpa.realism.tracks import HORIZON, Comparison, Generated, compare
 from envs.scene import LOG_STEPS, Scene
 
 BYTES_PER_GIB = 1 << 30
 BYTES_PER_POSE = 170
 """Peak memory of measuring a batch, by agents x steps x (rollouts and log); of 4 to 32 crowded scenes on a CPU."""
-
-_EVENTS = {
-    "collision_indication": "collision_per_step",
-    "offroad_indication": "offroad_per_step",
-    "traffic_light_violation": "traffic_light_violation_per_step",
-}
-_RATES = {
-    "collision_rate": "collision_per_step",
-    "offroad_rate": "offroad_per_step",
-    "traffic_light_violation_rate": "traffic_light_violation_per_step",
-}
 
 
 @dataclass(frozen=True)
@@ -249,12 +237,12 @@ def _batches(comparisons: list[Comparison], budget: float) -> Iterator[list[Comp
 
 
 def _score(measured: Features, config: RealismConfig, features: bool) -> RealismResult:
-    likelihood = {**_continuous_likelihoods(measured, config), **_indicator_likelihoods(measured, config)}
+    likelihood = {**continuous_likelihoods(measured, config), **indicator_likelihoods(measured, config)}
     weights, displacement = config.weights, measured.displacement
     return RealismResult(
         realism=sum(weights[name] * value for name, value in likelihood.items()),
         likelihood=likelihood,
-        rate=_rates(measured, config),
+        rate=event_rates(measured, config),
         min_ade=displacement.mean(1).min().item(),
         ade=displacement.mean().item(),
         features=measured if features else None,
@@ -323,83 +311,6 @@ def _check(scene: Scene, simulated: Tensor, config: RealismConfig, generated: Ge
             f"scene {scene.scene_id}: rollout {rollout} has {'xyz'[column] if column < 3 else 'heading'} = {value} for "
             f"track {track} at simulated step {step}; every present agent needs a finite state at every step."
         )
-
-
-def _continuous_likelihoods(measured: Features, config: RealismConfig) -> dict[str, float]:
-    """Likelihood of each continuous feature, one mean over the scored steps of all agents."""
-    masks = _masks(measured, config)
-    result = {}
-    for name, estimator in config.continuous.items():
-        value, mask = measured.values[name], masks[name]
-        score = log_likelihood(
-            value[0],
-            value[1:],
-            estimator,
-            None if Quirk.UNMASKED_SAMPLES in config.quirks else mask,
-            keep_nan=Quirk.NAN_IN_LAST_BIN in config.quirks,
-        )
-        result[name] = (torch.where(mask, score, 0).sum() / mask.sum()).exp().item()
-    return result
-
-
-def _masks(measured: Features, config: RealismConfig) -> dict[str, Tensor]:
-    """Steps ``[E, T]`` at which the log of each continuous feature counts."""
-    scored, steps = measured.scored, measured.scored.shape[-1]
-    # The official code looks for neighbours among the scored steps only, so the ends have none.
-    known = scored if Quirk.ENDS_UNSCORED in config.quirks else measured.valid
-    speed = _with_neighbours(known, config.differences)
-    acceleration = _with_neighbours(speed, config.differences)[:, -steps:]
-    ttc = scored & measured.vehicle[0, :, None] if config.ttc_vehicle_only else scored
-    if Quirk.LAST_TTC not in config.quirks and config.differences == "central":
-        ttc = ttc & (torch.arange(steps, device=ttc.device) < steps - 1)
-    return {
-        "linear_speed": speed[:, -steps:],
-        "angular_speed": speed[:, -steps:],
-        "linear_acceleration": acceleration,
-        "angular_acceleration": acceleration,
-        "distance_to_nearest_object": scored,
-        "distance_to_road_edge": scored,
-        "time_to_collision": ttc,
-    }
-
-
-def _with_neighbours(valid: Tensor, differences: Differences) -> Tensor:
-    """Steps whose difference is known (SPEC sections 2.3 and 8): ``[E, T]`` -> ``[E, T]``."""
-    result = torch.zeros_like(valid)
-    if differences == "central":
-        result[:, 1:-1] = valid[:, :-2] & valid[:, 2:]
-    else:
-        result[:, 1:] = valid[:, :-1] & valid[:, 1:]
-    return result
-
-
-def _indicator_likelihoods(measured: Features, config: RealismConfig) -> dict[str, float]:
-    """Likelihood of each event, one mean over all evaluated agents."""
-    result = {}
-    for name, indicator in config.indicators.items():
-        if _EVENTS[name] not in measured.values:
-            continue
-        happened = _happened(measured, _EVENTS[name], config)
-        if name == "traffic_light_violation":
-            happened = happened & measured.vehicle
-        result[name] = indicator_log_likelihood(happened[0], happened[1:], indicator).mean().exp().item()
-    return result
-
-
-def _rates(measured: Features, config: RealismConfig) -> dict[str, float]:
-    return {
-        name: _happened(measured, event, config)[1:].float().mean().item()
-        for name, event in _RATES.items()
-        if event in measured.values
-    }
-
-
-def _happened(measured: Features, event: str, config: RealismConfig) -> Tensor:
-    """``[C, E]`` bool: the event happened at some step at which the agent is there in the log."""
-    happened = measured.values[event]
-    if Quirk.GHOSTS not in config.quirks:
-        happened = happened & measured.scored
-    return happened.any(-1)
 
 
 def _weighted_mean(likelihood: Mapping[str, float], weights: Mapping[str, float], names: Sequence[str]) -> float:

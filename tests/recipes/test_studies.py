@@ -18,7 +18,7 @@ from recipes.cli import CONFIG
 from recipes.models import build_policy, policy_config, write_policy
 from recipes.sensitivity import Variants
 from recipes.sensitivity import summarise as summarise_variants
-from recipes.validity import summarise, windows
+from recipes.validity import compare_with, summarise, windows
 
 SMALL = ["num_rollouts=8", "memory=0.001"]
 
@@ -53,6 +53,17 @@ def test_a_distance_that_orders_realism_correlates_with_it_in_every_scene() -> N
     assert found["nearest"].mean == pytest.approx(0.15) and found["farthest"].mean == pytest.approx(-0.05)
     assert [window.mean for window in found["distance"]] == pytest.approx([0.5, 1, 1.5])
     assert found["nearest"].num_seeds == 2
+
+
+def test_rankings_are_compared_scene_by_scene() -> None:
+    scene = {
+        "omf": {"distance": [1.0, 2], "realism": [0.7, 0.4]},
+        "ade": {"distance": [1.0, 2], "realism": [0.6, 0.5]},
+        "random": {"realism": [0.5]},
+    }
+    found = compare_with({"0": [scene, scene]}, "ade")
+    assert list(found) == ["omf"]
+    assert found["omf"]["nearest"].mean == pytest.approx(0.1) and found["omf"]["farthest"].mean == pytest.approx(-0.1)
 
 
 def test_scenes_that_say_nothing_are_left_out() -> None:
@@ -90,7 +101,10 @@ def test_validity_scores_each_window_as_the_metric_does(
         assert np.array(first[0]["omf"]["realism"]) == pytest.approx(second[0]["omf"]["realism"], rel=1e-6)
     assert (tmp_path / "a/validity.png").stat().st_size > 10_000
     summary = json.loads((tmp_path / "a/summary.json").read_text())
-    assert summary["nearest_minus_ade"]["omf"]["scenes"] == 2
+    assert summary["minus"] == "ade" and summary["differences"]["omf"]["nearest"]["scenes"] == 2
+    other = run("validity", *command, "against=omf")
+    assert other.status == 0 and "minus that of 'omf'" in other.out, "nothing is measured again"
+    assert "against must be one of omf" in run("validity", *command, "against=chance").err
 
 
 def cfg_rankings() -> list[str]:

@@ -1,0 +1,100 @@
+"""Likelihood of the log under the rollouts, feature by feature and event by event (SPEC sections 6 and 7)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dpa.realism.config import Differences, RealismConfig
+from dpa.realism.estimators import indicator_log_likelihood, log_likelihood
+from dpa.realism.features import Features
+from dpa.realism.quirks import Quirk
+
+_EVENTS = {
+    "collision_indication": "collision_per_step",
+    "offroad_indication": "offroad_per_step",
+    "traffic_light_violation": "traffic_light_violation_per_step",
+}
+_RATES = {
+    "collision_rate": "collision_per_step",
+    "offroad_rate": "offroad_per_step",
+    "traffic_light_violation_rate": "traffic_light_violation_per_step",
+}
+
+
+def continuous_likelihoods(measured: Features, config: RealismConfig) -> dict[str, float]:
+    """Likelihood of each continuous feature, one mean over the scored steps of all agents."""
+    masks = _masks(measured, config)
+    result = {}
+    for name, estimator in config.continuous.items():
+        value, mask = measured.values[name], masks[name]
+        score = log_likelihood(
+            value[0],
+            value[1:],
+            estimator,
+            None if Quirk.UNMASKED_SAMPLES in config.quirks else mask,
+            keep_nan=Quirk.NAN_IN_LAST_BIN in config.quirks,
+        )
+        result[name] = (torch.where(mask, score, 0).sum() / mask.sum()).exp().item()
+    return result
+
+
+def _masks(measured: Features, config: RealismConfig) -> dict[str, Tensor]:
+    """Steps ``[E, T]`` at which the log of each continuous feature counts."""
+    scored, steps = measured.scored, measured.scored.shape[-1]
+    # The official code looks for neighbours among the scored steps only, so the ends have none.
+    known = scored if Quirk.ENDS_UNSCORED in config.quirks else measured.valid
+    speed = _with_neighbours(known, config.differences)
+    acceleration = _with_neighbours(speed, config.differences)[:, -steps:]
+    ttc = scored & measured.vehicle[0, :, None] if config.ttc_vehicle_only else scored
+    if Quirk.LAST_TTC not in config.quirks and config.differences == "central":
+        ttc = ttc & (torch.arange(steps, device=ttc.device) < steps - 1)
+    return {
+        "linear_speed": speed[:, -steps:],
+        "angular_speed": speed[:, -steps:],
+        "linear_acceleration": acceleration,
+        "angular_acceleration": acceleration,
+        "distance_to_nearest_object": scored,
+        "distance_to_road_edge": scored,
+        "time_to_collision": ttc,
+    }
+
+
+def _with_neighbours(valid: Tensor, differences: Differences) -> Tensor:
+    """Steps whose difference is known (SPEC sections 2.3 and 8): ``[E, T]`` -> ``[E, T]``."""
+    result = torch.zeros_like(valid)
+    if differences == "central":
+        result[:, 1:-1] = valid[:, :-2] & valid[:, 2:]
+    else:
+        result[:, 1:] = valid[:, :-1] & valid[:, 1:]
+    return result
+
+
+def indicator_likelihoods(measured: Features, config: RealismConfig) -> dict[str, float]:
+    """Likelihood of each event, one mean over all evaluated agents."""
+    result = {}
+    for name, indicator in config.indicators.items():
+        if _EVENTS[name] not in measured.values:
+            continue
+        happened = _happened(measured, _EVENTS[name], config)
+        if name == "traffic_light_violation":
+            happened = happened & measured.vehicle
+        result[name] = indicator_log_likelihood(happened[0], happened[1:], indicator).mean().exp().item()
+    return result
+
+
+def event_rates(measured: Features, config: RealismConfig) -> dict[str, float]:
+    """Share of rollouts and agents to which each event happened."""
+    return {
+        name: _happened(measured, event, config)[1:].float().mean().item()
+        for name, event in _RATES.items()
+        if event in measured.values
+    }
+
+
+def _happened(measured: Features, event: str, config: RealismConfig) -> Tensor:
+    """``[C, E]`` bool: the event happened at some step at which the agent is there in the log."""
+    happened = measured.values[event]
+    if Quirk.GHOSTS not in config.quirks:
+        happened = happened & measured.scored
+    return happened.any(-1)
