@@ -53,29 +53,27 @@ def plot_sensitivity(
         margins: for each range of margins its title and, by variant, the share of pairs in the same order.
         path: PNG to write.
     """
-    figure = blank_figure(11, 1.2 + 0.28 * max(len(agreement), 8))
-    left, right = figure.subplots(1, 2, width_ratios=[1, 1.3])
+    figure = blank_figure(10.5, 1.1 + 0.3 * len(agreement))
+    left, right = figure.subplots(1, 2, sharey=True)
     for row, value in enumerate(agreement.values()):
         left.plot([value.low, value.high], [row, row], color=CYCLE[0], lw=2.2, solid_capstyle="round")
         left.plot(value.mean, row, "o", color=CYCLE[0], ms=6, mec="white", mew=1)
-        left.annotate(f"{value.mean:.3f}", (value.mean, row), (0, 6), textcoords="offset points", **_SMALL)
     left.set_yticks(range(len(agreement)), list(agreement))
-    left.set_ylim(len(agreement) - 0.4, -0.8)
-    left.set_title("rank correlation with the distance (Spearman)")
-    places = np.arange(len(margins))
-    for color, name in zip(_colours(len(agreement)), agreement, strict=True):
-        right.plot(places, [values[name].mean for _, values in margins], "o-", color=color, ms=3.5, lw=1.2, label=name)
-    right.set_xticks(places, [title for title, _ in margins])
+    left.set_title("rank correlation with the distance (Spearman, 95 %)")
+    calm(left, "x")
+    shares = np.array([[values[name].mean for _, values in margins] for name in agreement])
+    # Half of the pairs agree by chance.
+    right.imshow(shares, cmap="Blues", vmin=0.5, vmax=1.3, aspect="auto")
+    for (row, column), share in np.ndenumerate(shares):
+        right.text(column, row, f"{share:.2f}", ha="center", va="center", fontsize=7.5, color=INK)
+    right.set_xticks(range(len(margins)), [title for title, _ in margins])
     right.set_xlabel("gap of a pair's distances over the scene's mean", fontsize=8, color=INK)
     right.set_title("share of pairs in the same order")
-    right.legend(frameon=False, fontsize=7, labelcolor=INK, ncols=2)
-    for axes, grid in ((left, "x"), (right, "y")):
-        calm(axes, grid)
-    left.tick_params(axis="y", length=0)
+    calm(right, "x")
+    right.grid(visible=False)
+    for axes in (left, right):
+        axes.tick_params(axis="y", length=0)
     save_figure(figure, path)
-
-
-_SMALL = {"ha": "center", "fontsize": 7, "color": INK}
 
 
 def _dots(axes: Axes, rows: Mapping[str, Mapping[str, Interval]]) -> None:

@@ -264,7 +264,9 @@ def _find(requests: Sequence[str]) -> list[str]:
     for request in requests:
         told = parse(request)
         if "num_scenes" not in told:
-            raise ValueError(f"{request!r}: num_scenes is missing among its options; say for example num_scenes=160,seed=0.")
+            raise ValueError(
+                f"{request!r}: num_scenes is missing among its options; say for example num_scenes=160,seed=0."
+            )
         made = units(**told)
         _try_files(made[0])
         inputs += [unit.text for unit in made]
