@@ -12,23 +12,21 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import hydra
-import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict
 from torch import Tensor
 
-from dpa.policy import make_context
 from dpa.preferences import PreferenceStore
 from dpa.ranking import FEATURES, PreferenceDistance
 from dpa.report.coupling import agent_name, couple_agent, plot_coupling
 from dpa.report.ranked import plot_ranked
-from dpa.rollout.poses import lifted
 from envs import keys
 from envs.scene import Scene
 from envs.store import SceneStore
 from recipes.cli import CONFIG, build, recipe
 from recipes.models import open_policy
 from recipes.rankings import open_preferences
+from recipes.rolled import stored
 from recipes.scenes import open_splits
 
 FIGURES = ("coupling", "rollouts")
@@ -74,16 +72,9 @@ def open_ranked(policy: Path, preferences: Path, scenes: SceneStore, name: str) 
             f"{preferences} holds {len(store)} of {len(scenes)} scenes and not scene {name}; collect on, or choose one "
             f"of them, for example scene={store.scenes[0] if len(store) else '...'}."
         )
-    scene = scenes[index]
-    context = make_context(scene, options)
-    ranked = store.read(rows, num_agents=len(context.kind))[0]
-    tokens, controlled = ranked[keys.TOKENS], ranked[keys.TOKEN_VALID][:, 0]
-    count = len(tokens)
-    decoded = model.tokenizer.decode_tracks(
-        tokens, context.recent.expand(count, -1, -1, -1), context.kind.expand(count, -1)
-    )
-    poses = torch.where(controlled[:, None, None], decoded, context.logged)  # as the environment replays the others
-    return RankedScene(scene, lifted(scene, poses), ranked, distance_of(store))
+    (rolled,) = stored(store, rows, scenes, model, options)
+    ranked = store.read(rows, num_agents=len(rolled.controlled))[0]
+    return RankedScene(rolled.scene, rolled.trajectories, ranked, distance_of(store))
 
 
 def distance_of(store: PreferenceStore) -> PreferenceDistance:
@@ -116,6 +107,7 @@ def chosen_rollout(rank: Tensor, name: str) -> int:
         ValueError: another word, or a number that is not there.
 
     Examples:
+        >>> import torch
         >>> [chosen_rollout(torch.tensor([1, 0, 2]), name) for name in ("best", "worst", "0")]
         [1, 2, 0]
     """

@@ -1,13 +1,16 @@
-"""The walk over what a collector gives, scene by scene."""
+"""Rollouts scene by scene: of what a collector gives, and of what a preference store holds."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
 from typing import NamedTuple
 
+import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from dpa.policy import ContextOptions, MotionLM, make_context
+from dpa.preferences import PreferenceStore
 from dpa.rollout import lifted, simulated_poses
 from envs import keys
 from envs.scene import Scene, SceneSource
@@ -49,3 +52,27 @@ def rolled(
             scene = scenes[index]
             trajectories = lifted(scene, poses[row])
             yield Rolled(index, scene, trajectories, controlled[row, : trajectories.shape[1]])
+
+
+def stored(
+    store: PreferenceStore, rows: Iterable[int], scenes: SceneSource, model: MotionLM, options: ContextOptions
+) -> Iterator[Rolled]:
+    """Some scenes of a preference store, as they drove: poses follow from tokens, and the log replays the others.
+
+    Args:
+        store: of the scenes and of the model.
+        rows: positions in the store.
+        scenes: that the store is of.
+        model: that made its rollouts; only its tokenizer is asked.
+        options: how the model cuts scenes up.
+    """
+    for row in rows:
+        index = int(store.scenes[row])
+        scene = scenes[index]
+        context = make_context(scene, options)
+        group = store.read([row], num_agents=len(context.kind))[0]
+        tokens, controlled = group[keys.TOKENS], group[keys.TOKEN_VALID][:, 0]
+        recent, kind = (value.expand(len(tokens), *value.shape) for value in (context.recent, context.kind))
+        decoded = model.tokenizer.decode_tracks(tokens, recent, kind)
+        trajectories = lifted(scene, torch.where(controlled[:, None, None], decoded, context.logged))
+        yield Rolled(index, scene, trajectories, controlled[: trajectories.shape[1]])

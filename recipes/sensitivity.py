@@ -16,10 +16,12 @@ from typing import Any
 
 import hydra
 import numpy as np
+import torch
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
+from dpa.preferences import nearest_farthest
 from dpa.ranking import Distance
 from dpa.ranking.agreement import rank_correlation, same_order
 from dpa.report.statistics import Interval, summary
@@ -98,12 +100,7 @@ class Variants:
 
     def turned(self, name: str) -> Interval:
         """Share of the pairs of the nearest quarter with the farthest one that the variant would turn round."""
-        quarter = self.base.shape[-1] // 4
-        order = self.base.argsort(-1, kind="stable")
-        near, far = order[..., :quarter], order[..., : -quarter - 1 : -1]
-        value = self.values[name]
-        gap = np.take_along_axis(value, far, -1) - np.take_along_axis(value, near, -1)
-        return summary((gap < 0).mean(-1))
+        return summary((quarter_gaps(self.base, self.values[name]) < 0).mean(-1))
 
     def by_margin(self, name: str, low: float, high: float) -> Interval | None:
         """Share of pairs in the same order, of those whose gap over the scene's mean lies in a range; None: no pair."""
@@ -123,18 +120,31 @@ class Variants:
 
         ``margin``: gap of their distances over the scene's mean; ``ade_agrees``: share that ADE would order alike.
         """
-        base, quarter = self.base[..., :rollouts], rollouts // 4
-        order = base.argsort(-1, kind="stable")
-        near, far = order[..., :quarter], order[..., : -quarter - 1 : -1]
-
-        def gap(value: np.ndarray) -> np.ndarray:
-            return np.take_along_axis(value, far, -1) - np.take_along_axis(value, near, -1)
-
+        base, ade = self.base[..., :rollouts], self.values[ADE][..., :rollouts]
         scale = np.maximum(self.base.mean(-1, keepdims=True), np.finfo(float).tiny)
         return {
-            "margin": summary((gap(base) / scale).mean(-1)),
-            "ade_agrees": summary((1 + np.sign(gap(self.values[ADE][..., :rollouts]))).mean(-1) / 2),
+            "margin": summary((quarter_gaps(base, base) / scale).mean(-1)),
+            "ade_agrees": summary((1 + np.sign(quarter_gaps(base, ade))).mean(-1) / 2),
         }
+
+
+def quarter_gaps(base: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """What a measure says of the pairs of the nearest quarter with the farthest one.
+
+    Args:
+        base: ``[..., K]`` distances that decide the pairs, as :func:`~dpa.preferences.nearest_farthest` does.
+        value: ``[..., K]`` of the same rollouts.
+
+    Returns:
+        ``[..., K // 4]``: value of the far rollout minus that of the near one.
+
+    Examples:
+        >>> quarter_gaps(np.array([0.1, 0.4, 0.2, 0.3]), np.array([1.0, 5.0, 2.0, 3.0]))
+        array([4.])
+    """
+    flat, quarter = torch.from_numpy(base).reshape(-1, base.shape[-1]), base.shape[-1] // 4
+    near, far = (side.numpy().reshape(*base.shape[:-1], quarter) for side in nearest_farthest(flat, quarter))
+    return np.take_along_axis(value, far, -1) - np.take_along_axis(value, near, -1)
 
 
 def summarise(variants: Variants) -> dict[str, Any]:

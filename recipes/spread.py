@@ -9,7 +9,7 @@ clipped, over all valid agent-steps. It goes into the feature's decorator, and `
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import hydra
@@ -17,17 +17,13 @@ import torch
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
-from torch import Tensor
 
-from dpa.policy import ContextOptions, MotionLM, make_context
-from dpa.preferences import PreferenceStore
 from dpa.ranking.features import FEATURES, feature_names, feature_weights, log_trajectory, occupancy_features
-from dpa.rollout import lifted
 from envs.progress import progress
-from envs.scene import Scene, SceneSource
 from recipes.cli import CONFIG, recipe, write_json
 from recipes.models import open_policy
 from recipes.rankings import open_preferences
+from recipes.rolled import Rolled, stored
 from recipes.scenes import open_splits
 
 
@@ -47,11 +43,11 @@ class Spread(NamedTuple):
     normalised: float
 
 
-def spreads(rollouts: Iterator[tuple[Scene, Tensor]], names: Sequence[str]) -> list[Spread]:
-    """Measure the spread of some features.
+def spreads(rollouts: Iterable[Rolled], names: Sequence[str]) -> list[Spread]:
+    """Measure the spread of some features over the controlled agents.
 
     Args:
-        rollouts: scenes, each with its rollouts ``[K, A, T, 4]``.
+        rollouts: scenes, each with its rollouts.
         names: of the features.
 
     Raises:
@@ -62,13 +58,13 @@ def spreads(rollouts: Iterator[tuple[Scene, Tensor]], names: Sequence[str]) -> l
         >>> scene = straight_road(1, speed=10.0)
         >>> log = log_trajectory(scene, 80)
         >>> faster = log + torch.arange(1, 81)[:, None] * torch.tensor([0.2, 0, 0, 0])
-        >>> spreads(iter([(scene, faster[None])]), ["speed"])[0].spread
+        >>> spreads([Rolled(0, scene, faster[None], torch.tensor([True]))], ["speed"])[0].spread
         2.0
     """
     total, count = torch.zeros(len(names), dtype=torch.float64), 0
-    for scene, poses in rollouts:
+    for _, scene, poses, controlled in rollouts:
         both = torch.cat((poses, log_trajectory(scene, poses.shape[2])[None]))
-        phi, valid = occupancy_features(scene, both, names)
+        phi, valid = occupancy_features(scene, both, names, ego=controlled.nonzero()[:, 0])
         total += (phi[:-1] - phi[-1:]).double().square().sum((0, 1, 2))
         count += len(poses) * int(valid.sum())
     if not count:
@@ -81,18 +77,6 @@ def spreads(rollouts: Iterator[tuple[Scene, Tensor]], names: Sequence[str]) -> l
     return [Spread(*row) for row in zip(names, *columns, strict=True)]
 
 
-def stored_rollouts(
-    store: PreferenceStore, scenes: SceneSource, model: MotionLM, options: ContextOptions
-) -> Iterator[tuple[Scene, Tensor]]:
-    """Scenes of a preference store with its rollouts ``[K, A, T, 4]``: their poses follow from their tokens."""
-    for row, index in enumerate(progress(store.scenes.tolist(), "spread", unit="scene")):
-        scene = scenes[index]
-        context = make_context(scene, options)
-        tokens = store.read([row], num_agents=len(context.kind))["tokens"][0]
-        recent, kind = (value.expand(len(tokens), *value.shape) for value in (context.recent, context.kind))
-        yield scene, lifted(scene, model.tokenizer.decode_tracks(tokens, recent, kind))
-
-
 @hydra.main(**CONFIG, config_name="spread")
 @recipe
 def main(cfg: DictConfig) -> None:
@@ -101,7 +85,8 @@ def main(cfg: DictConfig) -> None:
     scenes = open_splits(cfg.scenes)[cfg.split]
     model, options, _ = open_policy(cfg.policy)
     store = open_preferences(cfg.preferences, scenes, model, cfg.policy)
-    rows = spreads(stored_rollouts(store, scenes, model, options), names)
+    every = progress(range(len(store)), "spread", unit="scene")
+    rows = spreads(stored(store, every, scenes, model, options), names)
     table = Table(title=f"{len(store)} scenes, {store.provenance.num_rollouts} rollouts each", title_justify="left")
     for title in ("feature", "unit", "weight", "spread", "share, paper", "share, normalised"):
         table.add_column(title, justify="left" if title in ("feature", "unit") else "right")

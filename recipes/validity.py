@@ -22,7 +22,6 @@ from torch import Tensor
 
 from dpa.ranking import Distance
 from dpa.ranking.agreement import rank_correlation
-from dpa.ranking.distance import rank_of
 from dpa.realism import realism_of_groups
 from dpa.report.statistics import Interval, paired_bootstrap, summary
 from dpa.report.studies import plot_validity
@@ -50,7 +49,7 @@ def windows(distance: Tensor, size: int, stride: int) -> list[Tensor]:
         >>> windows(torch.tensor([0.3, 0.1, 0.2, 0.4]), size=2, stride=2)
         [tensor([1, 2]), tensor([0, 3])]
     """
-    order = rank_of(distance).argsort()
+    order = distance.argsort(stable=True)
     return [order[first : first + size] for first in range(0, len(order) - size + 1, stride)]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -28,6 +28,10 @@ The paper sums. One agent often carries most of a sum; ``median`` leaves such an
 order, and ``mean_rank`` gives each agent the same say: the mean over agents of the rollout's rank in the eyes of that
 agent, 1 for the nearest.
 """
+
+
+AGENTS = ("controlled", "evaluated")
+"""Whom a distance ranks: all controlled agents, or of these the SDC and the tracks to predict."""
 
 
 class Ranking(NamedTuple):
@@ -128,9 +132,7 @@ class PreferenceDistance:
         feature_weights(names, self.weights)
         feature_clips(names, self.clips)
         make_solver(self.method, **self.solver)
-        for option, known in (("aggregate", AGGREGATES), ("agents", ("controlled", "evaluated"))):
-            if getattr(self, option) not in known:
-                raise ValueError(f"unknown {option} {getattr(self, option)!r}; choose one of {sorted(known)}.")
+        check_options(self, aggregate=AGGREGATES, agents=AGENTS)
 
     def describe(self) -> dict[str, Any]:
         """The options that decide a ranking, with defaults filled in, ready for JSON."""
@@ -189,6 +191,21 @@ class PreferenceDistance:
         both = torch.cat((trajectories, log_trajectory(scene, trajectories.shape[2])[None].to(trajectories)))
         phi, valid = occupancy_features(scene, both, self.features, ego=ego, stride=self.stride, clips=self.clips)
         return phi[:-1], phi[-1:], valid
+
+
+def check_options(distance: object, **known: Collection[str]) -> None:
+    """Refuse an option of a distance that names nothing.
+
+    Args:
+        distance: whose attributes are looked at.
+        known: the names that each option may have.
+
+    Raises:
+        ValueError: the first one that has another; the message lists the known ones.
+    """
+    for option, names in known.items():
+        if getattr(distance, option) not in names:
+            raise ValueError(f"unknown {option} {getattr(distance, option)!r}; choose one of {sorted(names)}.")
 
 
 def ranked_agents(scene: Scene, controlled: Tensor | None, agents: str) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dpa.ranking.displacement import average_displacement, final_displacement
-from dpa.ranking.distance import AGGREGATES, Ranking, ranked_agents
+from dpa.ranking.distance import AGENTS, AGGREGATES, Ranking, check_options, ranked_agents
 from dpa.ranking.features import log_trajectory
 from envs.scene import CURRENT_STEP, Scene
 
@@ -44,10 +44,7 @@ class DisplacementDistance:
     agents: Literal["controlled", "evaluated"] = "controlled"
 
     def __post_init__(self) -> None:
-        options = {"measure": MEASURES, "aggregate": AGGREGATES, "agents": ("controlled", "evaluated")}
-        for option, known in options.items():
-            if getattr(self, option) not in known:
-                raise ValueError(f"unknown {option} {getattr(self, option)!r}; choose one of {sorted(known)}.")
+        check_options(self, measure=MEASURES, aggregate=AGGREGATES, agents=AGENTS)
 
     def describe(self) -> dict[str, Any]:
         """The options that decide a ranking, ready for JSON."""

@@ -14,6 +14,7 @@ from dpa.ranking import PreferenceDistance
 from dpa.ranking.features import feature_names, log_trajectory
 from envs.sources.synthetic import straight_road
 from recipes.cli import build
+from recipes.rolled import Rolled
 from recipes.spread import spreads
 
 
@@ -49,11 +50,26 @@ def test_rollouts_of_another_policy_are_refused(run: Callable, options: Callable
     assert "ranks rollouts of another policy than" in outcome.err
 
 
+def test_agents_that_the_log_replays_are_not_measured() -> None:
+    scene = straight_road(2, speed=10.0)
+    log = log_trajectory(scene, 80)
+    rollout = log.clone()
+    rollout[1] += torch.arange(1, 81)[:, None] * torch.tensor([0.3, 0, 0, 0])
+    rolled = Rolled(0, scene, rollout[None], torch.tensor([True, False]))
+    (row,) = spreads([rolled], ["effort"])
+    assert row.spread == 0
+    (row,) = spreads([rolled._replace(controlled=torch.tensor([False, True]))], ["speed"])
+    assert row.spread == pytest.approx(3.0, abs=1e-3)
+
+
 def test_only_valid_agent_steps_count_and_shares_follow_the_weights() -> None:
     scene = straight_road(1, speed=10.0)
     scene.agents.valid[0, 50:] = False
     rollout = log_trajectory(scene, 80) + torch.arange(1, 81)[:, None] * torch.tensor([0.3, 0, 0, 0])
-    rows = {row.feature: row for row in spreads(iter([(scene, rollout[None])]), ["speed", "clearance"])}
+    rows = {
+        row.feature: row
+        for row in spreads([Rolled(0, scene, rollout[None], torch.tensor([True]))], ["speed", "clearance"])
+    }
     assert rows["speed"].spread == pytest.approx(3.0, abs=1e-3)
     assert rows["clearance"].spread == 0
     assert (rows["speed"].paper, rows["speed"].normalised) == (1.0, 1.0)

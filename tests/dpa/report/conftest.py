@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from matplotlib.figure import Figure
 
 
 @pytest.fixture
@@ -42,3 +43,16 @@ def comparison() -> dict[str, Any]:
         "versions": {"torch": "2.13.0"},
         "command": "python -m recipes.compare 'name=<b>'",
     }  # fmt: skip
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Figures that were saved."""
+    saved, save = [], Figure.savefig
+
+    def keep(figure: Figure, *args: Any, **options: Any) -> None:
+        saved.append(figure)
+        save(figure, *args, **options)
+
+    monkeypatch.setattr(Figure, "savefig", keep)
+    return saved

@@ -34,19 +34,6 @@ def braking(scene: Scene) -> Tensor:
     return log + torch.stack((-12 * time**2, 3 * time, torch.zeros(80), torch.zeros(80)), -1)
 
 
-@pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Figures that were saved."""
-    saved, save = [], coupling.save_figure
-
-    def keep(figure: Any, path: Any) -> None:
-        saved.append(figure)
-        save(figure, path)
-
-    monkeypatch.setattr(coupling, "save_figure", keep)
-    return saved
-
-
 def with_hole(scene: Scene) -> Scene:
     scene.agents.valid[1, 30:50] = False
     return scene

@@ -16,19 +16,6 @@ from dpa.report.figures import plot_comparison, plot_curves, plot_scenes, read_c
 from envs.sources.synthetic import straight_road, two_cars_head_on
 
 
-@pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Figures that were saved."""
-    saved, save = [], figures.save_figure
-
-    def keep(figure: Any, path: Any) -> None:
-        saved.append(figure)
-        save(figure, path)
-
-    monkeypatch.setattr(figures, "save_figure", keep)
-    return saved
-
-
 def test_the_forest_draws_each_interval_and_greys_those_with_zero(
     comparison: dict[str, Any], tmp_path: Path, drawn: list[Any]
 ) -> None:

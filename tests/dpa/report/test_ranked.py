@@ -37,19 +37,6 @@ def rollouts(scene: Scene) -> Tensor:
     return torch.stack((log, stopped, away, slow))
 
 
-@pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Figures that were saved."""
-    saved, save = [], ranked.save_figure
-
-    def keep(figure: Any, path: Any) -> None:
-        saved.append(figure)
-        save(figure, path)
-
-    monkeypatch.setattr(ranked, "save_figure", keep)
-    return saved
-
-
 def marks(axes: Any, color: str) -> np.ndarray:
     """Where markers of one colour stand: ``[n, 2]``."""
     found = [c for c in axes.collections if isinstance(c, PathCollection) and len(c.get_offsets())]
