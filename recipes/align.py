@@ -11,15 +11,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import hydra
 import torch
+from numpy import nanmean
 from omegaconf import DictConfig
 from tensordict import TensorDict
 from torchrl.objectives import LossModule
 
 from dpa.losses import ContrastivePreferenceLoss, NextTokenLoss, token_network
-from dpa.policy import MotionLM
+from dpa.policy import ContextOptions, MotionLM
+from dpa.preferences import PreferenceStore
 from dpa.report.figures import read_curves
 from dpa.training.batches import Item, ShuffledOrder, collate_items, micro_batches
 from dpa.training.distributed import ALONE, Ranks, join_ranks
@@ -31,12 +34,25 @@ from envs.seeding import make_generator
 from envs.store import SceneStore
 from recipes.candidates import Group, make_candidates
 from recipes.cli import CONFIG, build, check_steps, finished, finite, plain, ranked_recipe, write_json
+from recipes.likelihoods import PROBED, make_probes, probe
 from recipes.models import open_policy, weights_digest, write_policy
 from recipes.rankings import open_preferences
 from recipes.scenes import open_splits
 
 LOSSES: dict[str, type[LossModule]] = {"contrastive": ContrastivePreferenceLoss, "next_token": NextTokenLoss}
 """Losses that a method's YAML can name."""
+
+
+class Watch(NamedTuple):
+    """Scenes that no loss sees, and ranked rollouts of them, to look at along the way.
+
+    Attributes:
+        scenes: tuning scenes.
+        preferences: folder of a store of ranked rollouts of them.
+    """
+
+    scenes: SceneStore
+    preferences: Path
 
 
 def align(
@@ -48,18 +64,23 @@ def align(
     seed: int,
     folder: Path,
     ranks: Ranks = ALONE,
+    *,
+    expert: Path | None = None,
+    watch: Watch | None = None,
 ) -> Path:
     """Fine-tune a policy with one method.
 
     Args:
         cfg: with the sections ``alignment``, ``logger``, ``device``.
-        method: ``name``, ``data`` and ``loss``, from ``config/method``.
+        method: ``data`` and ``loss``, from ``config/method``.
         scenes: that the preferences are of.
-        policy: file of the reference policy.
-        preferences: folder of the store that :mod:`recipes.collect` made with the reference.
+        policy: file of the policy to start from, which is also the reference of the loss.
+        preferences: folder of the store that :mod:`recipes.collect` made with it.
         seed: of batches and dropout.
-        folder: of the run.
+        folder: of the run; snapshots are kept in ``step_<step>`` inside.
         ranks: that train together; the scenes of a step are theirs together.
+        expert: folder of the store with the rollouts of an expert (``data.kind: expert``).
+        watch: what is looked at every ``alignment.watch_interval`` steps, for the curves ``tune/*``.
 
     Returns:
         The file of the aligned policy.
@@ -73,11 +94,13 @@ def align(
     model, context, config = open_policy(policy, device)
     store = open_preferences(preferences, scenes, model, policy)
     decided_by = {
-        "method": plain(method),
+        "data": plain(method.data),
+        "loss": plain(method.loss),
         "alignment": plain(options),
         "seed": seed,
         "reference": weights_digest(model),
-        "preferences": store.provenance.policy,
+        "ranking": store.provenance.ranking,
+        "expert": None if expert is None else PreferenceStore(expert).provenance.policy,
     }
     if ranks.agree(finished(result, decided_by) is not None and path.is_file(), "finished =", folder):
         return path
@@ -104,20 +127,53 @@ def align(
         description=method.name,
         ranks=ranks,
     )
+    look = Look(watch, context, model, options) if watch is not None and ranks.main else None
+    described = {"method": method.name, "seed": seed, "options": decided_by}
     with run:
         for step in run.steps():
+            if look is not None and step % options.watch_interval == 0:
+                run.log(look(device), step)
             draw = make_generator(seed, "pairs", step)
             groups = [candidates[i] for i in order(step)]
             ranks.seed_dropout(seed, step)
             losses = accumulate_gradients(loss, parts_of(groups, options, draw, device, ranks), ranks)
             norm = clip_and_step(optimizer, options.max_norm, schedule)
             run.log({f"train/{key}": value for key, value in losses.items()} | {"train/gradient_norm": norm})
+            if ranks.main and step + 1 in options.snapshots:
+                write_policy(folder / f"step_{step + 1}" / "policy.pt", model, config, described | {"step": step + 1})
+        if look is not None:
+            run.log(look(device), options.steps)
     if ranks.main:
-        write_policy(path, model, config, {"method": method.name, "seed": seed, "options": decided_by})
+        write_policy(path, model, config, described)
         last = {name: finite(curve["value"][-1]) for name, curve in read_curves(folder).items()}
         write_json(result, {"options": decided_by, "policy": str(path), "last_step": last})
     ranks.wait()
     return path
+
+
+class Look:
+    """A look at the policy in training: what it thinks of logs and rollouts of scenes that no loss sees.
+
+    Args:
+        watch: the scenes.
+        context: how scenes are cut up.
+        model: in training.
+        options: the section ``alignment``.
+    """
+
+    def __init__(self, watch: Watch, context: ContextOptions, model: MotionLM, options: DictConfig) -> None:
+        store = PreferenceStore(watch.preferences)
+        rows = range(min(options.watch_scenes, len(store)))
+        pairs = min(options.watch_pairs, store.provenance.num_rollouts // 2)
+        self.model, self.probes = model, make_probes(store, watch.scenes, context, model.tokenizer, pairs, rows)
+
+    def __call__(self, device: str) -> dict[str, float]:
+        """Means over the scenes, as curves are named."""
+        training = self.model.training
+        self.model.eval()
+        found = probe(self.model, self.probes, device)
+        self.model.train(training)
+        return {f"tune/{name}": nanmean([each[name] for each in found]) for name in PROBED}
 
 
 def make_loss(section: DictConfig, model: MotionLM) -> LossModule:
@@ -162,10 +218,23 @@ def make_batch(chosen: list[tuple[Group, torch.Tensor]]) -> TensorDict:
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.align``."""
     check_steps(cfg.alignment, "alignment")
-    scenes = open_splits(cfg.scenes).train
+    splits = open_splits(cfg.scenes)
     policy, preferences = Path(cfg.policy), Path(cfg.preferences)
+    expert = None if cfg.expert is None else Path(cfg.expert)
+    watch = None if cfg.watch is None else Watch(splits.tune, Path(cfg.watch))
     with join_ranks(cfg.device) as ranks:
-        path = align(cfg, cfg.method, scenes, policy, preferences, cfg.seed, Path(cfg.output), ranks)
+        path = align(
+            cfg,
+            cfg.method,
+            splits.train,
+            policy,
+            preferences,
+            cfg.seed,
+            Path(cfg.output),
+            ranks,
+            expert=expert,
+            watch=watch,
+        )
         if ranks.main:
             print(f"policy: {path}")
 

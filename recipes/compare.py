@@ -1,188 +1,201 @@
-"""The main job: from scenes to the comparison of six methods (METHOD section 6), for several seeds.
+"""Experiments: from scenes to a comparison of methods, for several seeds (METHOD sections 6 to 8).
 
-    python -m recipes.compare scenes=gpudrive scenes.train=DIR scenes.eval=DIR
-    make demo                                         # the same on SUMO scenes, in minutes
+    python -m recipes.compare scenes=gpudrive scenes.train=DIR scenes.eval=DIR output=runs/real
+    python -m recipes.compare experiment=features output=runs/real ...   # another question to the same references
+    make demo                                                            # the first one on SUMO scenes, in minutes
 
 For every seed: pre-train a reference, collect and rank its rollouts, align it with each method, choose each one's
-decoding on the tuning scenes, and evaluate once. Run the same command again to go on after a kill.
+checkpoint and decoding on the tuning scenes, and evaluate once. Experiments with the same output folder share what they
+can. Run the same command again to go on after a kill.
 """
 
 from __future__ import annotations
 
 import json
 import sys
-import time
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import hydra
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from dpa.preferences import PreferenceStore
-from dpa.report.table import print_table
-from recipes.align import align
-from recipes.candidates import make_candidates, pair_accuracy
-from recipes.cli import CONFIG, check_steps, finished, plain, recipe, write_json
-from recipes.collect import collect
-from recipes.evaluate import evaluate
-from recipes.models import open_policy, policy_config, weights_digest
-from recipes.pool import Job, Workers
-from recipes.pretrain import pretrain
+from dpa.policy import Decoding
+from dpa.report.table import REFERENCE, print_table
+from recipes.cli import CONFIG, check_steps, recipe, write_json
+from recipes.jobs import (
+    align_job,
+    collect_job,
+    evaluate_job,
+    likelihood_job,
+    pretrain_job,
+    rerank_job,
+    runs_of,
+)
+from recipes.methods import levels, read_setups
+from recipes.models import policy_config
+from recipes.pool import Workers
+from recipes.runs import SNAPSHOT
 from recipes.scenes import open_splits
-from recipes.summary import REFERENCE, summarise_comparison, write_report
+from recipes.stages import Stages
+from recipes.summary import summarise_experiment
+
+SPLITS = ("tune", "eval")
+"""What an experiment can report."""
+CHECKPOINTS = ("last", "select", "all")
+"""What becomes of the snapshots of an alignment: there are none, one of them may be chosen, or each is shown."""
 
 
-def pretrain_job(cfg: DictConfig, seed: int) -> None:
-    """Reference of one seed."""
-    pretrain(cfg, open_splits(cfg.scenes), seed, run_folder(cfg, seed, REFERENCE))
+class Chosen(NamedTuple):
+    """What the tuning scenes decided.
 
+    Attributes:
+        policies: method -> the policy that stands for it: its last one, or a snapshot.
+        decodings: method -> its own best decoding.
+    """
 
-def collect_job(cfg: DictConfig, seed: int, split: str) -> None:
-    """Ranked rollouts of one seed's reference on the training scenes, or on the evaluation scenes for pair accuracy."""
-    scenes = open_splits(cfg.scenes)[split]
-    collect(cfg, scenes, policy_of(cfg, seed, REFERENCE), seed, preferences_of(cfg, seed, split))
-
-
-def align_job(cfg: DictConfig, seed: int, method: str) -> None:
-    """One aligned policy."""
-    align(
-        cfg,
-        cfg.methods[method],
-        open_splits(cfg.scenes).train,
-        policy_of(cfg, seed, REFERENCE),
-        preferences_of(cfg, seed, "train"),
-        seed,
-        run_folder(cfg, seed, method),
-    )
-
-
-def evaluate_job(cfg: DictConfig, seed: int, method: str, split: str, top_p: float) -> None:
-    """One policy at one top-p, on the tuning or the evaluation scenes."""
-    if split == "tune":
-        cfg = OmegaConf.merge(cfg, {"evaluation": {"num_rollouts": cfg.decoding.num_rollouts}})
-    scenes = open_splits(cfg.scenes)[split]
-    evaluate(cfg, scenes, policy_of(cfg, seed, method), top_p, seed, result_of(cfg, seed, method, split, top_p))
-
-
-def accuracy_job(cfg: DictConfig, seed: int, method: str) -> None:
-    """Pair accuracy of one policy on the reference's ranked rollouts of the evaluation scenes (METHOD table 3)."""
-    path = run_folder(cfg, seed, method) / "pair_accuracy.json"
-    model, context, _ = open_policy(policy_of(cfg, seed, method), cfg.device)
-    data = cfg.methods.dpa_omf.data
-    decided_by = {"policy": weights_digest(model), "data": plain(data), "seed": seed}
-    if finished(path, decided_by) is None:
-        scenes = open_splits(cfg.scenes).eval
-        store = PreferenceStore(preferences_of(cfg, seed, "eval"))
-        pairs = make_candidates(data, store, scenes, context, model.tokenizer, seed)
-        write_json(path, {"options": decided_by, "pair_accuracy": pair_accuracy(model, pairs, cfg.device)})
-
-
-def run_folder(cfg: DictConfig, seed: int, method: str) -> Path:
-    """Folder of one training run."""
-    return Path(cfg.output) / f"seed_{seed}" / method
-
-
-def policy_of(cfg: DictConfig, seed: int, method: str) -> Path:
-    """Its policy."""
-    return run_folder(cfg, seed, method) / "policy.pt"
-
-
-def preferences_of(cfg: DictConfig, seed: int, split: str) -> Path:
-    """Ranked rollouts of a seed's reference."""
-    return Path(cfg.output) / f"seed_{seed}" / f"preferences_{split}"
-
-
-def result_of(cfg: DictConfig, seed: int, method: str, split: str, top_p: float) -> Path:
-    """Figures of one policy at one top-p."""
-    return run_folder(cfg, seed, method) / f"{split}_top_p_{top_p:g}.json"
-
-
-def choose_top_p(cfg: DictConfig, method: str) -> float:
-    """The top-p of the grid with the highest mean realism over seeds on the tuning scenes."""
-
-    def realism(top_p: float) -> float:
-        return sum(
-            finished_figures(result_of(cfg, seed, method, "tune", top_p))["mean"]["realism"] for seed in cfg.seeds
-        )
-
-    return max(cfg.decoding.grid, key=realism)
-
-
-def finished_figures(path: Path) -> dict[str, Any]:
-    """A result that a job of this run has written."""
-    return json.loads(path.read_text(encoding="utf-8"))
-
-
-class Stages:
-    """Runs the stages one after the other and keeps how long each took, over all calls until it was complete."""
-
-    def __init__(self, cfg: DictConfig, workers: Workers) -> None:
-        self.cfg, self.workers, self.path = cfg, workers, Path(cfg.output) / "stages.json"
-        self.kept: dict[str, dict[str, Any]] = finished_figures(self.path) if self.path.is_file() else {}
-
-    @property
-    def seconds(self) -> dict[str, float]:
-        """Seconds of each stage."""
-        return {name: entry["seconds"] for name, entry in self.kept.items()}
-
-    def run(self, name: str, job: Callable[..., None], arguments: list[tuple]) -> None:
-        """Run one job for each tuple of arguments; reading a complete stage back costs nothing in the account."""
-        entry = self.kept.setdefault(name, {"seconds": 0.0, "jobs": 0})
-        start = time.perf_counter()
-        jobs = [Job(job, (self.cfg, *each), " ".join(map(str, (name, *each)))) for each in arguments]
-        complete, left = entry["jobs"] == len(jobs), len(jobs)
-        try:
-            self.workers.run(jobs, name)
-            left = 0
-        finally:
-            if not complete:
-                entry["seconds"] += time.perf_counter() - start
-            entry["jobs"] = len(jobs) - left
-            write_json(self.path, self.kept)
+    policies: dict[str, str]
+    decodings: dict[str, Decoding]
 
 
 def compare(cfg: DictConfig) -> dict[str, Any]:
-    """Run every stage that is not done yet and write the report; returns the content of ``comparison.json``."""
-    for section in ("pretraining", "alignment"):  # a wrong option is told before hours of work
+    """Run every stage of an experiment that is not done yet and write what it found and the page.
+
+    Raises:
+        ValueError: options that do not fit, before any work.
+    """
+    check_experiment(cfg)
+    splits, runs = open_splits(cfg.scenes), runs_of(cfg)
+    with Workers(cfg.workers, cfg.threads) as workers:
+        stages = Stages(workers, runs.stages)
+        train_policies(cfg, stages)
+        chosen = choose(cfg, stages)
+        measure(cfg, stages, chosen)
+    found = summarise_experiment(cfg, splits, chosen.policies, chosen.decodings, stages.seconds)
+    write_json(runs.experiment(cfg.experiment.name), found)
+    return found
+
+
+def check_experiment(cfg: DictConfig) -> None:
+    """A wrong option is told before hours of work."""
+    for section in ("pretraining", "alignment"):
         check_steps(cfg[section], section)
     policy_config(cfg.model)
-    splits = open_splits(cfg.scenes)
-    with Workers(cfg.workers, cfg.threads) as workers:
-        stages = Stages(cfg, workers)
-        best = run_stages(cfg, stages)
-    comparison = summarise_comparison(cfg, splits, best, stages.seconds, lambda *run: result_of(cfg, *run))
-    write_report(cfg, splits, comparison)
-    return comparison
+    read_setups(cfg)
+    if cfg.experiment.split not in SPLITS:
+        raise ValueError(f"experiment.split must be one of {', '.join(SPLITS)}, got {cfg.experiment.split!r}.")
+    if cfg.experiment.checkpoints not in CHECKPOINTS:
+        raise ValueError(
+            f"experiment.checkpoints must be one of {', '.join(CHECKPOINTS)}, got {cfg.experiment.checkpoints!r}."
+        )
+    if cfg.experiment.checkpoints != "last" and not cfg.alignment.snapshots:
+        raise ValueError(
+            f"experiment.checkpoints={cfg.experiment.checkpoints} needs checkpoints: say for example "
+            f"alignment.snapshots=[{cfg.alignment.steps // 2}]."
+        )
+    if list(cfg.decoding.common) not in [list(each) for each in cfg.decoding.grid]:
+        raise ValueError(f"decoding.common={list(cfg.decoding.common)} must be one of decoding.grid.")
 
 
-def run_stages(cfg: DictConfig, stages: Stages) -> dict[str, float]:
-    """From pre-training to the figures of every policy; returns each method's own best top-p."""
-    seeds, methods, grid = list(cfg.seeds), [REFERENCE, *cfg.methods], list(cfg.decoding.grid)
-    stages.run("pretrain", pretrain_job, [(seed,) for seed in seeds])
-    stages.run("collect", collect_job, [(seed, split) for seed in seeds for split in ("train", "eval")])
-    stages.run("align", align_job, [(seed, method) for seed in seeds for method in cfg.methods])
-    every = [(seed, method) for method in methods for seed in seeds]
-    best = dict.fromkeys(methods, grid[0])
-    if len(grid) > 1:  # otherwise there is nothing to choose
-        stages.run("tune decoding", evaluate_job, [(*run, "tune", top_p) for run in every for top_p in grid])
-        best = {method: choose_top_p(cfg, method) for method in methods}
-    wanted = {(*run, "eval", top_p) for run in every for top_p in (cfg.decoding.common, best[run[1]])}
-    wanted |= {(seed, REFERENCE, "eval", top_p) for seed in seeds for top_p in grid}
-    stages.run("evaluate", evaluate_job, sorted(wanted))
-    stages.run("pair accuracy", accuracy_job, every)
-    return best
+def train_policies(cfg: DictConfig, stages: Stages) -> None:
+    """References, ranked rollouts and aligned policies."""
+    seeds, setups = list(cfg.seeds), read_setups(cfg)
+    stages.run("pretrain", pretrain_job, cfg, [(seed,) for seed in seeds])
+    splits = sorted({"tune", cfg.experiment.split})
+    stages.run("collect", collect_job, cfg, [(seed, split, REFERENCE) for seed in seeds for split in splits])
+    for level in levels(setups):
+        needed = [setups[method] for method in level]
+        sources = {policy for setup in needed for policy in (setup.start, setup.expert) if policy is not None}
+        stages.run(
+            "collect", collect_job, cfg, [(seed, "train", source) for seed in seeds for source in sorted(sources)]
+        )
+        again = sorted({(setup.start, setup.ranking) for setup in needed if setup.ranking is not None})
+        stages.run("rank", rerank_job, cfg, [(seed, *each) for seed in seeds for each in again])
+        stages.run("align", align_job, cfg, [(seed, method) for seed in seeds for method in level])
+
+
+def choose(cfg: DictConfig, stages: Stages) -> Chosen:
+    """Checkpoint and decoding of each method, by mean realism over seeds on the tuning scenes.
+
+    A checkpoint is chosen at the common decoding, then a decoding for it.
+    """
+    seeds, grid, common = list(cfg.seeds), decodings(cfg), Decoding(*cfg.decoding.common)
+    policies = {method: [method] for method in shown_policies(cfg)}
+    if cfg.experiment.checkpoints == "select":
+        policies |= {method: [*snapshots_of(cfg, method), method] for method in cfg.methods}
+
+    def tune(wanted: dict[str, list[tuple[str, Decoding]]]) -> None:
+        jobs = {
+            (seed, policy, "tune", *spec(each)) for runs in wanted.values() for policy, each in runs for seed in seeds
+        }
+        stages.run("tune", evaluate_job, cfg, sorted(jobs))
+
+    def best(runs: list[tuple[str, Decoding]]) -> tuple[str, Decoding]:
+        return max(runs, key=lambda run: tuning_realism(cfg, *run)) if len(runs) > 1 else runs[0]
+
+    candidates = {method: [(policy, common) for policy in among] for method, among in policies.items()}
+    tune({method: runs for method, runs in candidates.items() if len(runs) > 1})
+    checkpoint = {method: best(runs)[0] for method, runs in candidates.items()}
+    candidates = {method: [(policy, each) for each in grid] for method, policy in checkpoint.items()}
+    tune(candidates)
+    return Chosen(checkpoint, {method: best(runs)[1] for method, runs in candidates.items()})
+
+
+def measure(cfg: DictConfig, stages: Stages, chosen: Chosen) -> None:
+    """Every method at the common and at its own best decoding, on the split that the experiment reports.
+
+    The evaluation scenes are looked at once for each result. An experiment that looks for settings reports the tuning
+    scenes, which have been rolled out for the choice of decodings.
+    """
+    seeds, split, common = list(cfg.seeds), cfg.experiment.split, Decoding(*cfg.decoding.common)
+    wanted = {
+        (policy, each) for method, policy in chosen.policies.items() for each in (common, chosen.decodings[method])
+    }
+    wanted |= {(REFERENCE, each) for each in decodings(cfg)}
+    jobs = {(seed, policy, "eval", *spec(each)) for seed in seeds for policy, each in wanted}
+    stages.run("evaluate", evaluate_job, cfg, sorted(jobs))
+    stages.run("likelihood", likelihood_job, cfg, [(seed, p) for p in chosen.policies.values() for seed in seeds])
+
+
+def shown_policies(cfg: DictConfig) -> list[str]:
+    """What has a row of its own: the reference, every method, and its snapshots where all are shown."""
+    shown = [REFERENCE]
+    for method in cfg.methods:
+        shown += [*(snapshots_of(cfg, method) if cfg.experiment.checkpoints == "all" else []), method]
+    return shown
+
+
+def snapshots_of(cfg: DictConfig, method: str) -> list[str]:
+    """Names of the snapshots of a method."""
+    setup = read_setups(cfg)[method]
+    steps = setup.alignment.get("steps", cfg.alignment.steps)
+    snapshots = setup.alignment.get("snapshots", cfg.alignment.snapshots)
+    return [f"{method}{SNAPSHOT}{step}" for step in snapshots if step < steps]
+
+
+def decodings(cfg: DictConfig) -> list[Decoding]:
+    """The grid that decodings are chosen from."""
+    return [Decoding(*each) for each in cfg.decoding.grid]
+
+
+def spec(decoding: Decoding) -> tuple[float, float]:
+    """A decoding as a job's arguments."""
+    return decoding.top_p, decoding.temperature
+
+
+def tuning_realism(cfg: DictConfig, policy: str, decoding: Decoding) -> float:
+    """Sum over seeds of the mean realism on the tuning scenes."""
+    paths = [runs_of(cfg).evaluation(seed, policy, "tune", decoding) for seed in cfg.seeds]
+    return sum(json.loads(path.read_text(encoding="utf-8"))["mean"]["realism"] for path in paths)
 
 
 @hydra.main(**CONFIG, config_name="compare")
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.compare``."""
-    comparison = compare(cfg)
-    print_table(comparison["rows"], comparison["paired"], title="At the common top-p")
-    own = comparison["own_best"]
-    print_table(own["rows"], own["paired"], title="Each at its own best top-p, chosen on the tuning scenes")
-    print(f"report: {Path(cfg.output) / 'index.html'}")
+    found = compare(cfg)
+    print_table(found["rows"], found["paired"], title=f"{found['title']}: all at the same decoding")
+    own = found["own_best"]
+    print_table(own["rows"], own["paired"], title="Each at its own best decoding, chosen on the tuning scenes")
+    print(f"numbers: {runs_of(cfg).experiment(cfg.experiment.name)}")
 
 
 if __name__ == "__main__":

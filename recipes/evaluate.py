@@ -23,7 +23,7 @@ from dpa.rollout import make_collector
 from envs.progress import progress
 from envs.scene import CURRENT_STEP
 from envs.store import SceneStore
-from recipes.cli import CONFIG, finished, finite, plain, recipe, write_json
+from recipes.cli import CONFIG, build, finished, finite, plain, recipe, write_json
 from recipes.models import open_policy, weights_digest
 from recipes.partial import PartialResult
 from recipes.rankings import build_distance
@@ -50,7 +50,7 @@ def evaluate(
     cfg: DictConfig,
     scenes: SceneStore,
     policy: Path,
-    top_p: float,
+    decoding: Decoding,
     seed: int,
     path: Path,
     open_submission: Callable[[Sequence[str], Mapping[str, Any]], SubmissionWriter] | None = None,
@@ -61,7 +61,7 @@ def evaluate(
         cfg: with the sections ``evaluation``, ``collection.ranking`` and ``device``.
         scenes: to roll out.
         policy: file of the policy.
-        top_p: nucleus of the sampling.
+        decoding: how tokens are drawn.
         seed: of the sampling.
         path: JSON to write.
         open_submission: where the rollouts go as well, from :func:`~dpa.realism.submission.plan_submission`.
@@ -77,7 +77,7 @@ def evaluate(
         "scenes": fingerprint(scenes),
         "evaluation": plain(options),
         "ranking": plain(cfg.collection.ranking),
-        "top_p": top_p,
+        "decoding": asdict(decoding),
         "seed": seed,
     }
     done = finished(path, decided_by)
@@ -89,14 +89,16 @@ def evaluate(
     scored = partial.read()
     # A scene is done once it is scored and, where a submission is written, in there as well.
     ready = frozenset(scored) if submission is None else submission.done & scored.keys()
-    bar = progress(total=len(scenes), description=f"evaluate top-p {top_p:g}", initial=len(ready), unit="scene")
+    bar = progress(
+        total=len(scenes), description=f"evaluate top-p {decoding.top_p:g}", initial=len(ready), unit="scene"
+    )
     with bar, submission or nullcontext():
         batches = make_collector(
             scenes,
             model,
             num_rollouts=options.num_rollouts,
             done=ready,
-            decoding=Decoding(top_p, options.temperature),
+            decoding=decoding,
             options=context,
             seed=seed,
             memory=options.memory,
@@ -175,7 +177,8 @@ def main(cfg: DictConfig) -> None:
         rollouts = cfg.evaluation.num_rollouts
         plan = plan_submission(cfg.submission, cfg.submission_metadata, rollouts, cfg.submission_shards)
     scenes = open_splits(cfg.scenes)[cfg.split]
-    result = evaluate(cfg, scenes, Path(cfg.policy), cfg.decoding.top_p, cfg.seed, Path(cfg.json), plan)
+    decoding = build(Decoding, cfg.decoding, "decoding")
+    result = evaluate(cfg, scenes, Path(cfg.policy), decoding, cfg.seed, Path(cfg.json), plan)
     width = max(map(len, SCENE_FIGURES))
     for name, value in result["mean"].items():
         print(f"{name:{width}}  {'–' if value is None else format(value, '.4f')}")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, NamedTuple
@@ -58,8 +59,8 @@ class Workers:
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
 
-    def run(self, jobs: list[Job], name: str) -> None:
-        """Run jobs, as many at a time as there are workers.
+    def run(self, jobs: list[Job], name: str) -> Iterator[tuple[str, float]]:
+        """Run jobs, as many at a time as there are workers, and give each one's name and seconds as it ends.
 
         Args:
             jobs: in the order in which they start.
@@ -71,13 +72,13 @@ class Workers:
         """
         if self._pool is None:
             for job in progress(jobs, name, unit="job"):
-                _work(job, self.threads)
+                yield job.name, _work(job, self.threads)
             return
-        futures = [self._pool.submit(_work, job, self.threads) for job in jobs]
+        futures = {self._pool.submit(_work, job, self.threads): job.name for job in jobs}
         try:
             with progress(total=len(jobs), description=name, unit="job") as bar:
                 for future in as_completed(futures):
-                    future.result()
+                    yield futures[future], future.result()
                     bar.update()
         except BrokenProcessPool as error:
             raise ChildProcessError(
@@ -93,7 +94,9 @@ def _start(lock: Any, started: Any) -> None:
         use_line(started.value, lock)
 
 
-def _work(job: Job, threads: int) -> None:
+def _work(job: Job, threads: int) -> float:
     torch.set_num_threads(threads)
+    start = time.perf_counter()
     with stage(job.name):
         job.function(*job.arguments)
+    return time.perf_counter() - start

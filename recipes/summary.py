@@ -1,163 +1,166 @@
-"""From the results of all runs to ``comparison.json``, figures and the page."""
+"""From the results of all runs to what an experiment found."""
 
 from __future__ import annotations
 
 import json
+import os
+import platform
 import sys
-from collections.abc import Callable
+from collections.abc import Mapping
+from datetime import UTC, datetime
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig
 
 from dpa.policy import Decoding
-from dpa.report.figures import plot_comparison, plot_curves, plot_scenes, read_curves
-from dpa.report.page import Picture, write_page
 from dpa.report.statistics import compare_methods
 from dpa.report.table import REFERENCE
-from recipes.cli import plain, write_json
-from recipes.play import roll_out
+from recipes.cli import plain
+from recipes.evaluate import SCENE_FIGURES
+from recipes.jobs import runs_of
+from recipes.likelihoods import PROBED
+from recipes.runs import method_of
 from recipes.scenes import Splits
 
-FIGURES = (
-    "kinematic",
-    "interactive",
-    "map_based",
-    "realism",
-    "min_ade",
-    "collision_rate",
-    "offroad_rate",
-    "preference_distance",
-    "standing_moved",
-)
-CURVES = (
-    "train/nll_preferred",
-    "train/nll_unpreferred",
-    "train/pair_accuracy",
-    "train/logit_std",
-    "train/kl",
-    "train/entropy",
-)
-"""Scalars that are drawn (METHOD figures 4 and 6)."""
 PACKAGES = ("torch", "torchrl", "tensordict", "pot", "numpy", "dpa-omf")
+Run = tuple[str, Decoding]
+"""A method at a decoding."""
 
 
-def summarise_comparison(
+class Results:
+    """Reads the results of an experiment's runs.
+
+    Args:
+        cfg: of the experiment.
+        policies: method -> the policy that stands for it.
+    """
+
+    def __init__(self, cfg: DictConfig, policies: Mapping[str, str]) -> None:
+        self.runs, self.policies, self.seeds = runs_of(cfg), policies, list(cfg.seeds)
+        self.split = cfg.experiment.split
+
+    def row(self, method: str, decoding: Decoding, seed: int, split: str) -> dict[str, Any]:
+        """Means of one run, and the file with the values of every scene."""
+        path = self.runs.evaluation(seed, self.policies[method], split, decoding)
+        found = json.loads(path.read_text(encoding="utf-8"))
+        return {
+            "method": method,
+            "seed": seed,
+            "top_p": decoding.top_p,
+            "temperature": decoding.temperature,
+            "file": self.runs.relative(path),
+            "n_scenes": len(found["scenes"]),
+            **{name: found["mean"][name] for name in SCENE_FIGURES},
+        }
+
+    def rows(self, chosen: list[Run], split: str) -> list[dict[str, Any]]:
+        """Of several runs, each for all seeds."""
+        return [self.row(method, decoding, seed, split) for method, decoding in chosen for seed in self.seeds]
+
+    def likelihood(self, method: str, seed: int) -> dict[str, Any]:
+        """What a policy thinks of logs and rollouts of the reported scenes."""
+        path = self.runs.likelihood(seed, self.policies[method], self.split)
+        mean = json.loads(path.read_text(encoding="utf-8"))["mean"]
+        return {
+            "method": method,
+            "seed": seed,
+            "file": self.runs.relative(path),
+            **{name: mean[name] for name in (*PROBED, "kl")},
+        }
+
+    def paired(self, chosen: list[Run], reference: Run) -> list[dict[str, Any]]:
+        """Realism of each run minus that of a reference, by scene and seed, with intervals."""
+        scores = {
+            str(number): {str(seed): self._realism(*run, seed) for seed in self.seeds}
+            for number, run in enumerate([reference, *chosen])
+        }
+        found = compare_methods(scores, "0")
+        return [
+            entry
+            | {
+                "method": method,
+                "top_p": decoding.top_p,
+                "temperature": decoding.temperature,
+                "against": reference[0],
+                "against_top_p": reference[1].top_p,
+                "against_temperature": reference[1].temperature,
+            }
+            for (method, decoding), entry in zip(chosen, found, strict=True)
+        ]
+
+    def _realism(self, method: str, decoding: Decoding, seed: int) -> list[float]:
+        path = self.runs.evaluation(seed, self.policies[method], self.split, decoding)
+        return json.loads(path.read_text(encoding="utf-8"))["per_scene"]["realism"]
+
+
+def summarise_experiment(
     cfg: DictConfig,
     splits: Splits,
-    best: dict[str, float],
-    stages: dict[str, float],
-    result_of: Callable[[int, str, str, float], Path],
+    policies: Mapping[str, str],
+    own: Mapping[str, Decoding],
+    stages: Mapping[str, float],
 ) -> dict[str, Any]:
-    """The content of ``comparison.json``.
+    """The content of ``experiments/<name>.json``.
 
-    ``rows`` and ``paired`` compare at the common top-p, and show the reference at the others of the grid beside them:
-    sharper sampling alone can pass for alignment. ``own_best`` compares every method at its own best top-p with the
-    reference at its own.
+    ``rows`` and ``paired`` compare at the common decoding, and show the reference at the others of the grid beside
+    them: sharper sampling alone can pass for alignment. ``own_best`` compares every method at its own best decoding
+    with the reference at its own. ``tuning`` holds every method at every decoding, on the tuning scenes.
+
+    Args:
+        cfg: of the experiment.
+        splits: scenes.
+        policies: method -> the policy that stands for it, the reference first.
+        own: method -> its own best decoding.
+        stages: worker-seconds of each stage.
     """
-    common, methods = cfg.decoding.common, [REFERENCE, *cfg.methods]
-    others = [(REFERENCE, top_p) for top_p in cfg.decoding.grid if top_p != common]
-    at_common, at_best = [(m, common) for m in methods], [(m, best[m]) for m in methods]
-    results = {
-        (method, top_p, seed): json.loads(result_of(seed, method, "eval", top_p).read_text(encoding="utf-8"))
-        for method, top_p in {*at_common, *others, *at_best}
-        for seed in cfg.seeds
-    }
+    results, experiment = Results(cfg, policies), cfg.experiment
+    common, grid = Decoding(*cfg.decoding.common), [Decoding(*each) for each in cfg.decoding.grid]
+    at_common = [(method, common) for method in policies]
+    others = [(REFERENCE, each) for each in grid if each != common]
+    at_best = [(method, own[method]) for method in policies]
+    likelihood = [results.likelihood(method, seed) for method in policies for seed in cfg.seeds]
+    accuracy = {(entry["method"], entry["seed"]): entry["pair_accuracy"] for entry in likelihood}
 
-    def rows(runs: list[tuple[str, float]]) -> list[dict[str, Any]]:
-        return [
-            {
-                "method": method,
-                "seed": seed,
-                "top_p": top_p,
-                **{name: results[method, top_p, seed]["mean"][name] for name in FIGURES},
-                "pair_accuracy": _pair_accuracy(result_of(seed, method, "eval", top_p).parent),
-                "n_scenes": len(results[method, top_p, seed]["scenes"]),
-            }
-            for method, top_p in runs
-            for seed in cfg.seeds
-        ]
-
-    def paired(runs: list[tuple[str, float]], reference: tuple[str, float]) -> list[dict[str, Any]]:
-        scores = {
-            run: {str(seed): results[*run, seed]["per_scene"]["realism"] for seed in cfg.seeds}
-            for run in (reference, *runs)
-        }
-        found = compare_methods(
-            {f"{m} {p}": score for (m, p), score in scores.items()}, f"{reference[0]} {reference[1]}"
-        )
-        return [
-            {**entry, "method": method, "top_p": top_p, "against": reference[1]}
-            for (method, top_p), entry in zip(runs, found, strict=True)
-        ]
+    def rows(chosen: list[Run]) -> list[dict[str, Any]]:
+        found = results.rows(chosen, experiment.split)
+        return [row | {"pair_accuracy": accuracy[row["method"], row["seed"]]} for row in found]
 
     return {
+        **{
+            name: plain(experiment)[name]
+            for name in ("name", "title", "paper", "question", "headline", "axis", "split")
+        },
         "metric": cfg.evaluation.metric,
         "scenes": {**splits.sizes(), "source": cfg.scenes.source},
         "seeds": list(cfg.seeds),
+        "methods": list(policies),
+        "labels": labels(cfg, policies),
+        "published": plain(experiment.published),
+        "policies": dict(policies),
+        "common": [common.top_p, common.temperature],
+        "chosen": {method: [decoding.top_p, decoding.temperature] for method, decoding in own.items()},
         "rows": rows(at_common + others),
-        "paired": paired(at_common[1:] + others, at_common[0]),
-        "own_best": {"rows": rows(at_best), "paired": paired(at_best[1:], at_best[0])},
-        "per_scene": {
-            method: {str(seed): results[method, common, seed]["per_scene"]["realism"] for seed in cfg.seeds}
-            for method in methods
+        "paired": results.paired(at_common[1:] + others, at_common[0]),
+        "own_best": {"rows": rows(at_best), "paired": results.paired(at_best[1:], at_best[0])},
+        "tuning": results.rows([(method, each) for method in policies for each in grid], "tune"),
+        "likelihood": likelihood,
+        "curves": {
+            method: {str(seed): results.runs.relative(results.runs.training(seed, method)) for seed in cfg.seeds}
+            for method in cfg.methods
         },
-        "stages": stages,
+        "stages": dict(stages),
         "wall_seconds": sum(stages.values()),
+        "config": plain(cfg),
         "versions": {"python": sys.version.split()[0], **{name: version(name) for name in PACKAGES}},
+        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPU cores, device {cfg.device}",
+        "date": datetime.now(UTC).date().isoformat(),
         "command": " ".join(["python -m recipes.compare", *sys.argv[1:]]),
     }
 
 
-def write_report(cfg: DictConfig, splits: Splits, comparison: dict[str, Any]) -> None:
-    """``comparison.json``, its figures and ``index.html`` in the output folder."""
-    folder = Path(cfg.output)
-    write_json(folder / "comparison.json", comparison)
-    if cfg.json is not None:
-        write_json(cfg.json, comparison)
-    plot_comparison(comparison, folder / "comparison.png")
-    plot_comparison(comparison["own_best"], folder / "own_best.png")
-    seed = cfg.seeds[0]
-    runs = {method: read_curves(folder / f"seed_{seed}" / method) for method in cfg.methods}
-    plot_curves({m: {k: v for k, v in run.items() if k in CURVES} for m, run in runs.items()}, folder / "curves.png")
-    reference = read_curves(folder / f"seed_{seed}" / REFERENCE)
-    plot_curves(
-        {REFERENCE: {k: v for k, v in reference.items() if k.startswith(("train/loss", "tune/"))}},
-        folder / "pretraining.png",
-    )
-    players = roll_out(
-        {name: folder / f"seed_{seed}" / name / "policy.pt" for name in (REFERENCE, *cfg.methods)},
-        splits.eval,
-        range(min(cfg.pictures, len(splits.eval))),
-        decoding=Decoding(cfg.decoding.common, cfg.evaluation.temperature),
-        seed=seed,
-        device=cfg.device,
-    )
-    plot_scenes(
-        [player.scene for player in players],
-        {method: [player.rollouts[method] for player in players] for method in players[0].rollouts},
-        folder / "scenes.png",
-    )
-    write_page(
-        folder,
-        comparison,
-        [
-            Picture(folder / "comparison.png", "Differences to the reference. Paired per scene, with 95 % intervals."),
-            Picture(folder / "own_best.png", "Each method at its own best top-p. Chosen on the tuning scenes."),
-            Picture(
-                folder / "curves.png", f"Alignment of seed {seed}. Likelihood of preferred and unpreferred rollouts."
-            ),
-            Picture(
-                folder / "pretraining.png", f"Pre-training of seed {seed}. Next-token loss on train and tuning scenes."
-            ),
-            Picture(folder / "scenes.png", "Log and rollouts. Evaluation scenes, the same ones for every method."),
-        ],
-        players,
-        config=plain(cfg),
-        method="dpa_omf" if "dpa_omf" in cfg.methods else None,
-    )
-
-
-def _pair_accuracy(folder: Path) -> float:
-    return json.loads((folder / "pair_accuracy.json").read_text(encoding="utf-8"))["pair_accuracy"]
+def labels(cfg: DictConfig, policies: Mapping[str, str]) -> dict[str, str]:
+    """How tables call methods; a snapshot is called by its step."""
+    given = plain(cfg.experiment.labels)
+    named = {policy: given.get(method_of(policy), method_of(policy)) for policy in policies}
+    return {policy: name + policy.removeprefix(method_of(policy)).replace("@", " @ ") for policy, name in named.items()}

@@ -111,10 +111,15 @@ class Run:
                     if self.ranks.main:
                         self._checkpoints.save(done, capture(self.parts, progress=self.state))
 
-    def log(self, metrics: Mapping[str, Any]) -> None:
-        """Write numbers for the step at hand, as ``"<group>/<name>"``; on the main rank only."""
+    def log(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
+        """Write numbers, as ``"<group>/<name>"``, on the main rank only.
+
+        Args:
+            metrics: numbers, or tensors of one element.
+            step: updates that were made before; by default with the one at hand.
+        """
         if self._logger is not None:
-            self._logger.log(metrics, self._step)
+            self._logger.log(metrics, self._step if step is None else step)
 
     def __enter__(self) -> Run:
         return self

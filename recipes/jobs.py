@@ -1,0 +1,119 @@
+"""The jobs of a study, each a function of the configuration and of what names it, so that any worker can run it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from dpa.policy import Decoding
+from dpa.preferences import PreferenceStore
+from dpa.report.table import REFERENCE
+from envs.seeding import make_generator
+from recipes.align import Watch, align
+from recipes.cli import build, finished, finite, write_json
+from recipes.collect import collect
+from recipes.evaluate import evaluate
+from recipes.likelihoods import PROBED, divergence, make_probes, probe
+from recipes.methods import Setup
+from recipes.models import open_policy, weights_digest
+from recipes.pretrain import pretrain
+from recipes.rerank import rerank
+from recipes.runs import RunFolder
+from recipes.scenes import open_splits
+
+
+def pretrain_job(cfg: DictConfig, seed: int) -> None:
+    """Reference of one seed."""
+    pretrain(cfg, open_splits(cfg.scenes), seed, runs_of(cfg).training(seed, REFERENCE))
+
+
+def collect_job(cfg: DictConfig, seed: int, split: str, source: str) -> None:
+    """Ranked rollouts of one policy."""
+    runs, scenes = runs_of(cfg), open_splits(cfg.scenes)[split]
+    indices = learnt_from(cfg, len(scenes)) if split == "train" else None
+    collect(cfg, scenes, runs.policy(seed, source), seed, runs.preferences(seed, split, source), indices)
+
+
+def learnt_from(cfg: DictConfig, num_scenes: int) -> list[int] | None:
+    """Training scenes that alignment learns from, the same ones for all seeds; None: all of them."""
+    if cfg.aligned_scenes is None or cfg.aligned_scenes >= num_scenes:
+        return None
+    drawn = torch.randperm(num_scenes, generator=make_generator(cfg.scenes.split_seed, "aligned scenes"))
+    return sorted(drawn[: cfg.aligned_scenes].tolist())
+
+
+def rerank_job(cfg: DictConfig, seed: int, source: str, ranking: str) -> None:
+    """The same rollouts, ranked by another distance."""
+    runs, scenes = runs_of(cfg), open_splits(cfg.scenes).train
+    section = OmegaConf.merge(cfg.collection.ranking, cfg.rankings[ranking])
+    given, made = (runs.preferences(seed, "train", source, name) for name in (None, ranking))
+    rerank(section, scenes, runs.policy(seed, source), given, made)
+
+
+def align_job(cfg: DictConfig, seed: int, method: str) -> None:
+    """One aligned policy."""
+    runs, splits, setup = runs_of(cfg), open_splits(cfg.scenes), setup_of(cfg, method)
+    align(
+        OmegaConf.merge(cfg, {"alignment": setup.alignment}),
+        cfg.methods[method],
+        splits.train,
+        runs.policy(seed, setup.start),
+        runs.preferences(seed, "train", setup.start, setup.ranking),
+        seed,
+        runs.training(seed, method),
+        expert=None if setup.expert is None else runs.preferences(seed, "train", setup.expert),
+        watch=Watch(splits.tune, runs.preferences(seed, "tune")),
+    )
+
+
+def evaluate_job(cfg: DictConfig, seed: int, policy: str, split: str, top_p: float, temperature: float) -> None:
+    """One policy at one decoding, on the tuning or the evaluation scenes."""
+    if split == "tune":
+        cfg = OmegaConf.merge(cfg, {"evaluation": {"num_rollouts": cfg.decoding.num_rollouts}})
+    runs, scenes, decoding = runs_of(cfg), open_splits(cfg.scenes)[split], Decoding(top_p, temperature)
+    evaluate(cfg, scenes, runs.policy(seed, policy), decoding, seed, runs.evaluation(seed, policy, split, decoding))
+
+
+def likelihood_job(cfg: DictConfig, seed: int, policy: str, split: str) -> None:
+    """How likely logs and the reference's rollouts of a split are, and the drift from the reference."""
+    runs, scenes = runs_of(cfg), open_splits(cfg.scenes)[split]
+    path, store = runs.likelihood(seed, policy, split), PreferenceStore(runs.preferences(seed, split))
+    model, options, _ = open_policy(runs.policy(seed, policy), cfg.device)
+    reference, _, _ = open_policy(runs.policy(seed, REFERENCE), cfg.device)
+    pairs = store.provenance.num_rollouts // 4
+    decided_by = {
+        "policy": weights_digest(model),
+        "reference": weights_digest(reference),
+        "pairs": pairs,
+        "rollouts": cfg.drift_rollouts,
+        "ranking": store.provenance.ranking,
+        "seed": seed,
+    }
+    if finished(path, decided_by) is not None:
+        return
+    probes = make_probes(store, scenes, options, model.tokenizer.cpu(), pairs)
+    found = probe(model.to(cfg.device), probes, cfg.device)
+    per_scene = {name: [finite(each[name]) for each in found] for name in PROBED}
+    per_scene["kl"] = divergence(
+        model, reference, scenes, options, num_rollouts=cfg.drift_rollouts, seed=seed, device=cfg.device
+    )
+    mean = {name: math.fsum(known) / len(known) for name, known in _known(per_scene).items()}
+    ids = [scenes.scene_ids[index] for index in store.scenes.tolist()]
+    write_json(path, {"options": decided_by, "mean": mean, "scenes": ids, "per_scene": per_scene})
+
+
+def _known(per_scene: dict[str, list[float | None]]) -> dict[str, list[float]]:
+    return {name: [value for value in values if value is not None] for name, values in per_scene.items()}
+
+
+def runs_of(cfg: DictConfig) -> RunFolder:
+    """The folder of the study."""
+    return RunFolder(Path(cfg.output))
+
+
+def setup_of(cfg: DictConfig, method: str) -> Setup:
+    """How one method hangs together with the others."""
+    return build(Setup, cfg.experiment.setup.get(method) or OmegaConf.create({}), f"experiment.setup.{method}")

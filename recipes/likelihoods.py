@@ -1,0 +1,181 @@
+"""How likely logs, preferred and unpreferred rollouts are under a policy (METHOD table 3, figures 4, 6 and 7)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from dpa.policy import ContextOptions, Decoding, MotionLM, SceneContext, collate_contexts
+from dpa.policy.actor import Contexts
+from dpa.preferences import PreferenceStore, nearest_farthest
+from dpa.rollout import make_collector
+from dpa.tokens import MotionTokenizer
+from dpa.training.batches import log_item
+from envs import keys
+from envs.scene import SceneSource
+
+PROBED = ("pair_accuracy", "nll_demonstration", "nll_preferred", "nll_unpreferred", "entropy")
+"""What :func:`probe` measures of every scene."""
+
+
+class Probe(NamedTuple):
+    """A log and ranked rollouts of one scene: what every policy is asked about, whatever it has learnt from.
+
+    Attributes:
+        context: uncollated.
+        demonstration: ``[A, T]`` tokens of the log.
+        demonstration_valid: ``[A, T]`` bool.
+        preferred: ``[M, A, T]`` tokens of the rollouts nearest to the log.
+        unpreferred: ``[M, A, T]`` tokens of the farthest ones.
+        valid: ``[A, T]`` bool, of the rollouts.
+    """
+
+    context: SceneContext
+    demonstration: Tensor
+    demonstration_valid: Tensor
+    preferred: Tensor
+    unpreferred: Tensor
+    valid: Tensor
+
+
+def make_probes(
+    store: PreferenceStore,
+    scenes: SceneSource,
+    options: ContextOptions,
+    tokenizer: MotionTokenizer,
+    pairs: int,
+    rows: Iterable[int] | None = None,
+) -> list[Probe]:
+    """Probes from ranked rollouts.
+
+    Args:
+        store: of rollouts, ranked by the distance that is asked about.
+        scenes: that it is of.
+        options: how scenes are cut up.
+        tokenizer: of logs.
+        pairs: M, at most half of the rollouts of a scene.
+        rows: of the store; all by default.
+    """
+    contexts = Contexts(scenes, options)
+    near, far = nearest_farthest(store.distance, pairs)
+    probes = []
+    for row in range(len(store)) if rows is None else rows:
+        context = contexts[int(store.scenes[row])]
+        group = store.read([row], num_agents=len(context.kind))[0]
+        log, tokens = log_item(context, tokenizer), group[keys.TOKENS]
+        probes.append(
+            Probe(
+                context,
+                log.tokens[0],
+                log.token_valid,
+                tokens[near[row]],
+                tokens[far[row]],
+                group[keys.TOKEN_VALID],
+            )
+        )
+    return probes
+
+
+@torch.no_grad()
+def probe(model: MotionLM, probes: Iterable[Probe], device: str = "cpu") -> list[dict[str, float]]:
+    """Ask a policy about each probe.
+
+    Args:
+        model: in whatever mode it is; dropout would count.
+        probes: of some scenes.
+        device: of the model.
+
+    Returns:
+        For each probe ``pair_accuracy`` (share of pairs whose preferred rollout is the more likely one), the negative
+        log-likelihood per token [nats] of the demonstration, of the preferred and of the unpreferred rollouts, and the
+        ``entropy`` per token [nats] along the rollouts. NaN where the demonstration has no token.
+    """
+    found = []
+    for each in probes:
+        context = collate_contexts([each.context]).to(device)
+        tokens = torch.cat((each.preferred, each.unpreferred))[None].to(device)
+        valid = each.valid[None, None].to(device)
+        log_probs = model(context, tokens, valid).log_softmax(-1)[0]
+        chosen = log_probs.gather(-1, tokens[0, ..., None])[..., 0] * valid[0]
+        near, far = chosen.sum((-1, -2)).chunk(2)
+        count = each.valid.sum()
+        log_tokens = each.demonstration[None, None].to(device)
+        log_valid = each.demonstration_valid.to(device)
+        log = model(context, log_tokens, log_valid[None, None]).log_softmax(-1)
+        log = log.gather(-1, log_tokens[..., None])[0, 0, ..., 0]
+        entropy = -(log_probs.exp() * log_probs).sum(-1)
+        found.append(
+            {
+                "pair_accuracy": (near > far).double().mean().item(),
+                "nll_demonstration": -log[log_valid].mean().item(),
+                "nll_preferred": -near.mean().item() / count.item(),
+                "nll_unpreferred": -far.mean().item() / count.item(),
+                "entropy": ((entropy * valid[0]).sum() / (count * len(tokens[0]))).item(),
+            }
+        )
+    return found
+
+
+def divergence(
+    model: MotionLM,
+    reference: MotionLM,
+    scenes: SceneSource,
+    options: ContextOptions,
+    *,
+    num_rollouts: int,
+    seed: int,
+    memory: float = 0.25,
+    device: str = "cpu",
+) -> list[float]:
+    """KL(model || reference) per token [nats] of each scene, in order (METHOD figure 7, right).
+
+    The expectation is taken over the model's own rollouts, drawn from its whole distribution, and is exact within each
+    token.
+
+    Args:
+        model: aligned policy.
+        reference: policy that it started from.
+        scenes: to roll out.
+        options: how they are cut up.
+        num_rollouts: of each scene.
+        seed: of the rollouts.
+        memory: GiB for rollouts.
+        device: of both.
+    """
+    contexts = Contexts(scenes, options)
+    batches = make_collector(
+        scenes,
+        model,
+        num_rollouts=num_rollouts,
+        decoding=Decoding(top_p=1.0),
+        options=options,
+        seed=seed,
+        memory=memory,
+        device=device,
+    )
+    found = {index: _kl(model, reference, contexts[index], *group) for index, *group in _groups(batches, num_rollouts)}
+    return [found[index] for index in range(len(scenes))]
+
+
+def _groups(batches: Iterable[TensorDictBase], num_rollouts: int) -> Iterator[tuple[int, Tensor, Tensor]]:
+    """Scene, tokens ``[K, A, T]`` and controlled ``[A]`` of every group of a collector's batches ``[S * K, T]``."""
+    for batch in batches:
+        tokens = batch[keys.TOKEN].movedim(1, -1)
+        for first in range(0, len(batch), num_rollouts):
+            group = slice(first, first + num_rollouts)
+            yield int(batch[keys.SCENE][first, 0]), tokens[group], batch[keys.CONTROLLED][first, 0]
+
+
+@torch.no_grad()
+def _kl(model: MotionLM, reference: MotionLM, context: SceneContext, tokens: Tensor, controlled: Tensor) -> float:
+    num_agents = len(context.kind)
+    tokens, controlled = tokens[None, :, :num_agents], controlled[:num_agents]
+    valid = controlled[None, None, :, None].expand(1, 1, -1, tokens.shape[-1])
+    context = collate_contexts([context]).to(tokens.device)
+    log_probs, base = (policy(context, tokens, valid).log_softmax(-1) for policy in (model, reference))
+    per_token = (log_probs.exp() * (log_probs - base)).sum(-1)
+    return per_token[valid.expand_as(per_token)].mean().item()

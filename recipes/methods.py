@@ -1,0 +1,80 @@
+"""How the methods of an experiment hang together: who starts from whom, and whose rollouts each learns from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from omegaconf import DictConfig
+
+from dpa.report.table import REFERENCE
+from recipes.cli import build
+from recipes.runs import SNAPSHOT
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What sets a method of an experiment apart beside its data and its loss.
+
+    Attributes:
+        start: the policy that it starts from and whose rollouts it learns from: the reference, or another method of
+            the experiment (a further round).
+        expert: method whose rollouts are the preferred ones (``data.kind: expert``).
+        ranking: name of the distance, in ``rankings``, that ranks the rollouts again; None keeps the collection's.
+        alignment: options of the section ``alignment`` that differ.
+    """
+
+    start: str = REFERENCE
+    expert: str | None = None
+    ranking: str | None = None
+    alignment: Mapping[str, Any] = field(default_factory=dict)
+
+
+def read_setups(cfg: DictConfig) -> dict[str, Setup]:
+    """The setup of every method, in an order in which each comes after those that it needs.
+
+    Args:
+        cfg: with ``methods``, ``rankings`` and ``experiment.setup``.
+
+    Raises:
+        ValueError: a setup of no method, a policy or ranking that does not exist, or methods that need each other.
+    """
+    given = cfg.experiment.setup
+    for name in given:
+        if name not in cfg.methods:
+            raise ValueError(f"experiment.setup.{name}: there is no such method; there are {', '.join(cfg.methods)}.")
+    for name in (REFERENCE, *(name for name in cfg.methods if SNAPSHOT in name)):
+        if name in cfg.methods:
+            raise ValueError(f"methods.{name}: {REFERENCE!r} and names with {SNAPSHOT!r} are taken; call it otherwise.")
+    setups = {name: build(Setup, given.get(name) or DictConfig({}), f"experiment.setup.{name}") for name in cfg.methods}
+    for name, setup in setups.items():
+        for policy in (setup.start, setup.expert or REFERENCE):
+            if policy not in (REFERENCE, *cfg.methods):
+                raise ValueError(f"experiment.setup.{name} names {policy!r}, which is no method of the experiment.")
+        if setup.ranking is not None and setup.ranking not in cfg.rankings:
+            raise ValueError(
+                f"experiment.setup.{name}.ranking={setup.ranking!r} is not among rankings: {', '.join(cfg.rankings)}."
+            )
+    return {name: setups[name] for level in levels(setups) for name in level}
+
+
+def levels(setups: Mapping[str, Setup]) -> list[list[str]]:
+    """Methods in groups: those of one group need only the reference and methods of the groups before.
+
+    Raises:
+        ValueError: methods that need each other.
+
+    Examples:
+        >>> levels({"omf_2": Setup(start="omf"), "omf": Setup(), "sft": Setup()})
+        [['omf', 'sft'], ['omf_2']]
+    """
+    done, left, found = {REFERENCE}, dict(setups), []
+    while left:
+        ready = [name for name, setup in left.items() if {setup.start, setup.expert or REFERENCE} <= done]
+        if not ready:
+            raise ValueError(f"experiment.setup: {', '.join(left)} need each other; one must start from the reference.")
+        found.append(ready)
+        done |= set(ready)
+        left = {name: setup for name, setup in left.items() if name not in ready}
+    return found

@@ -1,0 +1,75 @@
+"""Rank the rollouts of a preference store by another distance: they are not rolled out again.
+
+python -m recipes.rerank policy=runs/pretrain/policy.pt preferences=runs/preferences ranking.features=progress
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
+from torch import Tensor
+
+from dpa.preferences import PreferenceStore, PreferenceWriter
+from dpa.ranking import Ranking
+from dpa.ranking.distance import rank_of
+from envs import keys
+from envs.progress import progress
+from envs.store import SceneStore
+from recipes.cli import CONFIG, recipe
+from recipes.models import open_policy
+from recipes.rankings import build_distance, open_preferences
+from recipes.rolled import stored
+from recipes.scenes import open_splits
+
+
+def rerank(ranking: DictConfig, scenes: SceneStore, policy: Path, preferences: Path, folder: Path) -> PreferenceStore:
+    """Fill a preference store with the rollouts of another one, ranked anew; goes on after a kill.
+
+    Args:
+        ranking: options of the distance, as in ``config/ranking``.
+        scenes: that the rollouts are of.
+        policy: file of the policy that made them.
+        preferences: folder of the store that holds them.
+        folder: of the store to fill.
+    """
+    model, options, _ = open_policy(policy)
+    store, distance = open_preferences(preferences, scenes, model, policy), build_distance(ranking, "ranking")
+    provenance = replace(store.provenance, ranking=distance.describe())
+    with PreferenceWriter(folder, provenance) as writer:
+        rows = [row for row, scene in enumerate(store.scenes.tolist()) if scene not in writer.scenes_done]
+        bar = progress(total=len(store), description="rank", initial=len(store) - len(rows), unit="scene")
+        with bar:
+            for row, each in zip(rows, stored(store, rows, scenes, model, options), strict=True):
+                ranked = distance(each.scene, each.trajectories, each.controlled)
+                group = store.read([row], num_agents=each.trajectories.shape[1])
+                writer.append(group.update(_fields(ranked)))
+                bar.update()
+    return PreferenceStore(folder)
+
+
+def _fields(ranked: Ranking) -> dict[str, Tensor]:
+    """What a ranking decides, for a batch of one group."""
+    return {
+        keys.DISTANCE: ranked.distance[None],
+        keys.AGENT_DISTANCE: ranked.agent_distance[None],
+        keys.ADE: ranked.ade[None],
+        keys.AGENT_RANKED: ranked.agent_ranked[None],
+        keys.FEATURE_SHARE: ranked.feature_share[None],
+        keys.RANK: rank_of(ranked.distance[None]),
+    }
+
+
+@hydra.main(**CONFIG, config_name="rerank")
+@recipe
+def main(cfg: DictConfig) -> None:
+    """Entry point of ``python -m recipes.rerank``."""
+    scenes = open_splits(cfg.scenes)[cfg.split]
+    store = rerank(cfg.ranking, scenes, Path(cfg.policy), Path(cfg.preferences), Path(cfg.output))
+    print(f"preferences of {len(store)} scenes: {cfg.output}")
+
+
+if __name__ == "__main__":
+    main()
