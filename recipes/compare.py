@@ -146,13 +146,13 @@ def measure(cfg: DictConfig, stages: Stages, chosen: Chosen) -> None:
     scenes, which have been rolled out for the choice of decodings.
     """
     seeds, split, common = list(cfg.seeds), cfg.experiment.split, Decoding(*cfg.decoding.common)
-    wanted = {
-        (policy, each) for method, policy in chosen.policies.items() for each in (common, chosen.decodings[method])
-    }
+    wanted = {(policy, common) for policy in chosen.policies.values()}
+    wanted |= {(policy, chosen.decodings[method]) for method, policy in chosen.policies.items()}
     wanted |= {(REFERENCE, each) for each in decodings(cfg)}
-    jobs = {(seed, policy, "eval", *spec(each)) for seed in seeds for policy, each in wanted}
-    stages.run("evaluate", evaluate_job, cfg, sorted(jobs))
-    stages.run("likelihood", likelihood_job, cfg, [(seed, p) for p in chosen.policies.values() for seed in seeds])
+    jobs = sorted((seed, policy, split, *spec(decoding)) for seed in seeds for policy, decoding in wanted)
+    stages.run("evaluate", evaluate_job, cfg, jobs)
+    policies = list(chosen.policies.values())
+    stages.run("likelihood", likelihood_job, cfg, [(seed, policy, split) for policy in policies for seed in seeds])
 
 
 def shown_policies(cfg: DictConfig) -> list[str]:

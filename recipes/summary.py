@@ -24,6 +24,8 @@ from recipes.runs import method_of
 from recipes.scenes import Splits
 
 PACKAGES = ("torch", "torchrl", "tensordict", "pot", "numpy", "dpa-omf")
+TOLD = ("name", "title", "paper", "question", "headline", "axis", "split")
+"""What an experiment says of itself."""
 Run = tuple[str, Decoding]
 """A method at a decoding."""
 
