@@ -50,6 +50,7 @@ SECTIONS = {
     "align": ("threads", "scenes", "alignment"),
     "evaluate": ("threads", "scenes", "collection", "evaluation"),
     "play": ("threads", "scenes"),
+    "rerank": ("threads", "scenes"),
     "spread": ("threads", "scenes"),
     "ladder": ("threads", "scenes", "model", "evaluation"),
     "tokens": ("threads", "scenes", "model"),

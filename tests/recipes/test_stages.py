@@ -7,7 +7,9 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import torch
@@ -16,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from dpa.losses import ContrastivePreferenceLoss, token_network
 from dpa.policy import MotionLM, make_context
-from dpa.preferences import PreferenceStore, nearest_farthest
+from dpa.preferences import PreferenceStore, PreferenceWriter, nearest_farthest
 from dpa.realism.score import score
 from dpa.realism.submission import validate
 from dpa.tokens import VerletTokenizer
@@ -368,6 +370,57 @@ def test_pair_accuracy_is_the_share_of_pairs_whose_preferred_rollout_is_likelier
     assert pair_accuracy(Scorer(), groups, "cpu") == pytest.approx(2 / 3)
 
 
+# --- rank again -----------------------------------------------------------------------------------------------------
+def rerank_into(folder: Path, runs: Path, options: Callable) -> list[str]:
+    given = (f"policy={runs / 'reference/policy.pt'}", f"preferences={runs / 'preferences'}", f"output={folder}")
+    return options("rerank", *given, "ranking.features=progress", "ranking.stride=5")
+
+
+def test_rollouts_ranked_again_are_ranked_as_if_collected_with_that_distance(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path
+) -> None:
+    outcome = run("rerank", *rerank_into(tmp_path / "again", runs, options))
+    assert outcome.status == 0, outcome.err
+    fresh = collect_into(tmp_path / "fresh", runs, options)
+    assert run("collect", *fresh, "collection.ranking.features=progress").status == 0
+    mine, other = (PreferenceStore(tmp_path / name) for name in ("again", "fresh"))
+    assert mine.provenance == other.provenance
+    assert mine.provenance.ranking != PreferenceStore(runs / "preferences").provenance.ranking
+    for row in range(len(other)):
+        for key, value in other[row].items():
+            torch.testing.assert_close(mine[row][key], value, atol=1e-4, rtol=1e-4)
+    assert not torch.allclose(mine.distance, PreferenceStore(runs / "preferences").distance)
+
+
+def test_ranking_again_goes_on_after_a_kill(run: Callable, options: Callable, runs: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "again"
+    assert run("rerank", *rerank_into(folder, runs, options)).status == 0
+    whole = contents(folder)
+    shutil.rmtree(folder)
+    with (
+        mock.patch("recipes.rerank.rank_of", side_effect=[torch.arange(4)[None]] * 3 + [KeyboardInterrupt]),
+        mock.patch("recipes.rerank.PreferenceWriter", partial(PreferenceWriter, chunk_scenes=1)),
+    ):
+        assert run("rerank", *rerank_into(folder, runs, options)).status == 130
+    assert len(PreferenceStore(folder)) == 3
+    assert run("rerank", *rerank_into(folder, runs, options)).status == 0
+    assert contents(folder) == whole
+
+
+def test_rollouts_of_another_policy_are_not_ranked_again(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path
+) -> None:
+    other = options("pretrain", f"output={tmp_path / 'other'}", "seed=7")
+    assert run("pretrain", *other).status == 0
+    command = [
+        f"policy={tmp_path / 'other/policy.pt'}" if option.startswith("policy=") else option
+        for option in rerank_into(tmp_path / "again", runs, options)
+    ]
+    outcome = run("rerank", *command)
+    assert outcome.status == 2 and "ranks rollouts of another policy" in outcome.err
+    assert not (tmp_path / "again").exists()
+
+
 # --- evaluate -------------------------------------------------------------------------------------------------------
 def score_into(path: Path, runs: Path, options: Callable) -> list[str]:
     return options("evaluate", f"policy={runs / 'reference/policy.pt'}", f"json={path}")
@@ -525,20 +578,21 @@ def test_a_scene_to_play_that_is_not_there_is_told(
 def test_jobs_run_here_one_after_the_other() -> None:
     ran: list[int] = []
     with Workers(1, threads=1) as workers:
-        workers.run([Job(ran.append, (number,), f"job {number}") for number in range(3)], "jobs")
+        ended = list(workers.run([Job(ran.append, (number,), f"job {number}") for number in range(3)], "jobs"))
     assert ran == [0, 1, 2]
+    assert [name for name, _ in ended] == ["job 0", "job 1", "job 2"] and all(seconds >= 0 for _, seconds in ended)
 
 
 def test_the_error_of_a_job_is_the_error_of_all_and_the_workers_go_on() -> None:
     with Workers(2, threads=1) as workers:
         with pytest.raises(ValueError, match="Expecting property name"):
-            workers.run([Job(json.loads, ("{",), "bad")], "jobs")
-        workers.run([Job(json.loads, ("{}",), "good")], "jobs")
+            list(workers.run([Job(json.loads, ("{",), "bad")], "jobs"))
+        assert [name for name, _ in workers.run([Job(json.loads, ("{}",), "good")], "jobs")] == ["good"]
 
 
 def test_a_killed_worker_is_told_with_what_to_do() -> None:
     with Workers(2, threads=1) as workers, pytest.raises(ChildProcessError, match="'jobs' was killed.*workers=1"):
-        workers.run([Job(os._exit, (1,), "dies")], "jobs")
+        list(workers.run([Job(os._exit, (1,), "dies")], "jobs"))
 
 
 def test_a_number_of_workers_that_is_not_positive_is_refused() -> None:

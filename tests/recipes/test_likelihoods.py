@@ -1,0 +1,89 @@
+"""What policies think of logs and ranked rollouts, against sums written out by hand."""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from dpa.policy import ContextOptions, MotionLM, SceneContext, make_context
+from dpa.tokens import VerletTokenizer
+from envs.sources.synthetic import straight_road
+from recipes.likelihoods import Probe, divergence, probe
+
+V = 4
+
+
+class Steady(nn.Module):
+    """The same distribution over tokens everywhere."""
+
+    def __init__(self, probabilities: list[float]) -> None:
+        super().__init__()
+        self.logits = torch.tensor(probabilities).log()
+
+    def forward(self, context: SceneContext, tokens: Tensor, valid: Tensor) -> Tensor:
+        return self.logits.expand(*tokens.shape, V)
+
+
+def test_a_policy_is_asked_for_the_likelihood_of_logs_and_of_both_sides() -> None:
+    probabilities = [0.5, 0.25, 0.125, 0.125]
+    valid = torch.tensor([[True, True, True], [True, False, False]])
+    asked = Probe(
+        context=make_context(straight_road(2)),
+        demonstration=torch.tensor([[0, 1, 2], [3, 3, 3]]),
+        demonstration_valid=torch.tensor([[True, True, True], [False, False, False]]),
+        preferred=torch.tensor([[[0, 0, 0], [0, 3, 3]], [[2, 2, 2], [2, 0, 0]]]),
+        unpreferred=torch.tensor([[[1, 1, 1], [1, 0, 0]], [[1, 1, 1], [1, 0, 0]]]),
+        valid=valid,
+    )
+    found = probe(Steady(probabilities), [asked])[0]
+    nats = [-math.log(p) for p in probabilities]
+    assert found["pair_accuracy"] == 0.5  # 0s are likelier than 1s, and 2s are not
+    assert found["nll_demonstration"] == pytest.approx((nats[0] + nats[1] + nats[2]) / 3)
+    assert found["nll_preferred"] == pytest.approx((4 * nats[0] + 4 * nats[2]) / 8)
+    assert found["nll_unpreferred"] == pytest.approx(nats[1])
+    assert found["entropy"] == pytest.approx(sum(p * n for p, n in zip(probabilities, nats, strict=True)))
+
+
+def test_a_log_without_tokens_has_no_likelihood() -> None:
+    tokens, nothing = torch.zeros(1, 1, 2, dtype=torch.int64), torch.zeros(1, 2, dtype=torch.bool)
+    asked = Probe(make_context(straight_road(1)), tokens[0], nothing, tokens, tokens + 1, ~nothing)
+    found = probe(Steady([0.4, 0.3, 0.2, 0.1]), [asked])[0]
+    assert math.isnan(found["nll_demonstration"]) and found["pair_accuracy"] == 1
+
+
+@pytest.fixture(scope="module")
+def model() -> MotionLM:
+    torch.manual_seed(0)
+    return MotionLM("nano", VerletTokenizer()).eval()
+
+
+def test_a_policy_does_not_diverge_from_itself(model: MotionLM) -> None:
+    scenes = [straight_road(1), straight_road(3)]
+    options = ContextOptions()
+    same = divergence(model, model, scenes, options, num_rollouts=2, seed=0)
+    assert same == pytest.approx([0, 0], abs=1e-6)
+
+
+def test_divergence_is_that_of_the_distributions_along_the_models_own_rollouts(model: MotionLM) -> None:
+    """With a head that forgets its input, every token has the same distribution, whatever was driven before."""
+    steady = [copy.deepcopy(model) for _ in range(2)]
+    generator = torch.Generator().manual_seed(0)
+    biases = []
+    for each in steady:
+        head = [layer for layer in each.modules() if isinstance(layer, nn.Linear) and layer.out_features == 169][-1]
+        with torch.no_grad():
+            head.weight.zero_()
+            head.bias.copy_(torch.randn(169, generator=generator))
+        biases.append(head.bias.detach().double())
+    p, q = (bias.log_softmax(-1) for bias in biases)
+    expected = (p.exp() * (p - q)).sum().item()
+    found = divergence(*steady, [straight_road(2)], ContextOptions(), num_rollouts=2, seed=0)
+    assert found == pytest.approx([expected], abs=1e-5)
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])
