@@ -1,7 +1,21 @@
-"""Losses as TorchRL ``LossModule``s: next token (eq. 1) and contrastive preference (eq. 4)."""
+"""Losses as TorchRL ``LossModule``s: next token (eq. 1) and preferences (eq. 4 and its relatives)."""
 
 from dpa.losses.contrastive import ContrastivePreferenceLoss
+from dpa.losses.kahneman_tversky import KahnemanTverskyLoss
 from dpa.losses.network import token_network
 from dpa.losses.next_token import NextTokenLoss
+from dpa.losses.plackett_luce import PlackettLuceLoss
+from dpa.losses.preference import Comparison, PreferenceLoss, Side
+from dpa.losses.saturation import SaturationWatch
 
-__all__ = ["ContrastivePreferenceLoss", "NextTokenLoss", "token_network"]
+__all__ = [
+    "Comparison",
+    "ContrastivePreferenceLoss",
+    "KahnemanTverskyLoss",
+    "NextTokenLoss",
+    "PlackettLuceLoss",
+    "PreferenceLoss",
+    "SaturationWatch",
+    "Side",
+    "token_network",
+]

@@ -1,56 +1,87 @@
-"""Contrastive preference loss over pairs of rollouts (METHOD eq. 4 and section 5)."""
+"""Contrastive preference losses over pairs of rollouts: CPL (METHOD eq. 4), DPO, IPO, SimPO, and by agent."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple, get_args
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictParams, dispatch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torch.nn import functional as F
-from torchrl.objectives import LossModule
 
-from dpa.losses.network import CONTEXT, LOGITS, scene_mean, token_log_prob
+from dpa.losses.preference import (
+    Comparison,
+    PreferenceLoss,
+    Reduction,
+    Side,
+    check_choice,
+    check_not_negative,
+)
 from envs import keys
 
-Reduction = Literal["sum", "agent_mean", "token_mean"]
-SATURATED = 0.01
-"""A pair whose weight lies this close to 0 or 1 no longer weighs preferences."""
+Link = Literal["logistic", "squared", "hinge"]
+Credit = Literal["scene", "agent"]
 
 
-class ContrastivePreferenceLoss(LossModule):
-    """Raises the likelihood of preferred rollouts over that of unpreferred ones of the same scene.
+class Curve(NamedTuple):
+    """The cost of a logit, and how strongly it pulls: minus the derivative."""
 
-    With the score of a rollout ``A = alpha * reduce(log pi - log pi_ref)`` over its valid tokens, a pair costs
-    ``softplus(lambda * A_unpreferred - A_preferred)`` (eq. 4; ``reference=False`` leaves ``log pi_ref`` out, as the
-    paper does).
+    cost: Callable[[Tensor], Tensor]
+    weight: Callable[[Tensor], Tensor]
+
+
+LINKS: dict[str, Curve] = {
+    "logistic": Curve(lambda logit: F.softplus(-logit), lambda logit: torch.sigmoid(-logit)),
+    "squared": Curve(lambda logit: (logit - 0.5) ** 2, lambda logit: 1 - 2 * logit),
+    "hinge": Curve(lambda logit: (1 - logit).relu(), lambda logit: (logit < 1).to(logit.dtype)),
+}
+
+
+class ContrastivePreferenceLoss(PreferenceLoss):
+    """Raises the likelihood of preferred rollouts over that of unpreferred ones of the same scene, pair by pair.
+
+    With the scores ``A`` of :class:`~dpa.losses.PreferenceLoss`, the logit of a pair is
+    ``h = A_preferred - lambda * A_unpreferred - margin``, and a pair costs ``(1 - e) link(h) + e link(-h)``:
+
+    ========= ================ ==========================================================================
+    link      cost             with
+    ========= ================ ==========================================================================
+    logistic  softplus(-h)     CPL without a reference (eq. 4; Hejna et al. 2024), DPO with one (Rafailov
+                               et al. 2023), SimPO with token means and a margin (Meng et al. 2024)
+    squared   (h - 1/2)^2      IPO (Azar et al. 2024): alpha^2 times its ``(h / alpha - 1 / (2 alpha))^2``
+    hinge     max(0, 1 - h)    SLiC (Zhao et al. 2023)
+    ========= ================ ==========================================================================
 
     The default starts with equal weights for all pairs, because both scores are 0. The plain sum without a reference
     starts with scores of hundreds of nats: nearly every pair then has weight 0 or 1, improbable winners dominate and
     the policy flattens (watch ``logit_std`` and ``saturated`` at the first step, and ``entropy`` later).
 
+    With ``credit="agent"`` each agent's own tokens are compared, in the direction that the agent itself prefers: it
+    may be nearer to its log in the rollout that is the farther one as a whole. A pair costs the mean over the agents
+    that have a say, and nothing where none has; lambda acts on the side that the agent prefers less.
+
     Args:
         actor_network: from :func:`~dpa.losses.token_network`.
 
     Keyword Args:
-        alpha: scale of a score (1 / temperature of the preference model).
+        link: what a logit costs.
+        alpha: scale of a score; the beta of DPO, IPO and SimPO.
         conservative: lambda in (0, 1], the factor on the unpreferred score (Hejna et al. 2024).
-        reference: subtract the log-likelihood under a frozen copy of the network as it is now.
-        score_reduction: ``"sum"`` over agents and decisions as in eq. 4, ``"agent_mean"`` sums over decisions and
-            averages over agents, ``"token_mean"`` averages over both.
-        cloning: weight of the negative log-likelihood per token of the preferred rollouts, averaged over scenes.
+        margin: by which the preferred score is to be ahead, in units of the logit; the gamma of SimPO.
+        label_smoothing: e in [0, 0.5), the share of pairs that may be the wrong way round (conservative DPO).
+        credit: what is compared, ``"scene"`` (all agents of a rollout together) or ``"agent"``.
+        reference: see :class:`~dpa.losses.PreferenceLoss`.
+        score_reduction: see there; of an agent's own tokens where agents are compared.
+        cloning: see there.
 
     Raises:
-        ValueError: an option outside its range.
-
-    Returns ``loss_preference``, ``loss_cloning`` and, detached: ``logit_mean``, ``logit_std``, ``weight_mean`` and
-    ``saturated`` of the pairs, ``pair_accuracy`` (the preferred rollout is the more likely one), ``nll_preferred``,
-    ``nll_unpreferred`` and ``entropy`` per token [nats] and, with a reference, ``kl`` to it per token [nats]. Every
-    one is a mean over scenes, so a step is the same however its scenes are split into parts or among ranks.
+        ValueError: an option outside its range; in a step, sides of different sizes, or agents' preferences missing.
 
     Examples:
+        >>> from tensordict import TensorDict
         >>> from dpa.losses import token_network
         >>> from dpa.policy import MotionLM, collate_contexts, make_context
         >>> from dpa.tokens import VerletTokenizer
@@ -70,134 +101,88 @@ class ContrastivePreferenceLoss(LossModule):
     """
 
     @dataclass
-    class _AcceptedKeys:
+    class _AcceptedKeys(PreferenceLoss._AcceptedKeys):
         """Keys of the input.
 
         Attributes:
-            context: :class:`~dpa.policy.SceneContext` of batch size ``[S]``.
-            preferred: ``[S, M, A, T]`` int64.
-            unpreferred: ``[S, M, A, T]`` int64, pair by pair.
-            token_valid: ``[S, 1, A, T]`` bool, the same for both sides of a pair.
+            agent_preference: ``[S, M, A]`` int64, 1 where an agent itself prefers the preferred rollout of a pair, -1
+                the unpreferred one, 0 where it has no say; read with ``credit="agent"`` only.
         """
 
-        context: NestedKey = CONTEXT
-        preferred: NestedKey = keys.PREFERRED
-        unpreferred: NestedKey = keys.UNPREFERRED
-        token_valid: NestedKey = keys.TOKEN_VALID
+        agent_preference: NestedKey = keys.AGENT_PREFERENCE
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
-    actor_network: TensorDictModule
-    actor_network_params: TensorDictParams
-    target_actor_network_params: TensorDictParams
-    diagnostics = [
-        "logit_mean",
-        "logit_std",
-        "weight_mean",
-        "saturated",
-        "pair_accuracy",
-        "nll_preferred",
-        "nll_unpreferred",
-        "entropy",
-    ]
 
     def __init__(
         self,
         actor_network: TensorDictModule,
         *,
+        link: Link = "logistic",
         alpha: float = 0.1,
         conservative: float = 1.0,
+        margin: float = 0.0,
+        label_smoothing: float = 0.0,
+        credit: Credit = "scene",
         reference: bool = True,
         score_reduction: Reduction = "sum",
         cloning: float = 0.0,
     ) -> None:
-        super().__init__()
-        if alpha <= 0:
-            raise ValueError(f"alpha must be positive, got {alpha}.")
+        check_choice("link", link, get_args(Link))
+        check_choice("credit", credit, get_args(Credit))
+        check_not_negative("margin", margin)
         if not 0 < conservative <= 1:
             raise ValueError(f"conservative (lambda) must lie in (0, 1], got {conservative}.")
-        if score_reduction not in ("sum", "agent_mean", "token_mean"):
-            raise ValueError(f"score_reduction must be 'sum', 'agent_mean' or 'token_mean', got {score_reduction!r}.")
-        if cloning < 0:
-            raise ValueError(f"cloning must not be negative, got {cloning}.")
-        self.convert_to_functional(actor_network, "actor_network", create_target_params=reference)
-        # The reference stays as it is: tell torchrl, which warns otherwise, that no updater is missing.
-        self._has_update_associated["actor_network"] = True
-        self.alpha, self.conservative, self.reference = alpha, conservative, reference
-        self.score_reduction, self.cloning = score_reduction, cloning
+        if not 0 <= label_smoothing < 0.5:
+            raise ValueError(f"label_smoothing must lie in [0, 0.5), got {label_smoothing}.")
+        super().__init__(
+            actor_network, alpha=alpha, reference=reference, score_reduction=score_reduction, cloning=cloning
+        )
+        self.link, self.conservative, self.margin = link, conservative, margin
+        self.label_smoothing, self.credit = label_smoothing, credit
 
     @property
     def in_keys(self) -> list[NestedKey]:
         """Where the input lies, in the order in which plain tensors are taken."""
-        accepted = self.tensor_keys
-        return [accepted.context, accepted.preferred, accepted.unpreferred, accepted.token_valid]
+        return super().in_keys + ([self.tensor_keys.agent_preference] if self.credit == "agent" else [])
 
-    @property
-    def out_keys(self) -> list[str]:
-        """``loss_preference``, ``loss_cloning`` and the diagnostics."""
-        return ["loss_preference", "loss_cloning", *self.diagnostics, *(["kl"] if self.reference else [])]
+    def compare(self, preferred: Side, unpreferred: Side, tensordict: TensorDictBase) -> Comparison:
+        """Each pair, or each agent of it."""
+        sizes = preferred.gain.shape[1], unpreferred.gain.shape[1]
+        if sizes[0] != sizes[1]:
+            raise ValueError(
+                f"pairs need as many preferred as unpreferred rollouts of a scene, got {sizes[0]} and {sizes[1]}; "
+                "KahnemanTverskyLoss and PlackettLuceLoss take any numbers."
+            )
+        if self.credit == "agent":
+            return self._by_agent(preferred.agent_score, unpreferred.agent_score, self._say(tensordict, preferred))
+        logit = self._logit(preferred.score, unpreferred.score)
+        return Comparison(self._smooth("cost", logit), logit.detach(), self._smooth("weight", logit.detach()))
 
-    def _forward_value_estimator_keys(self, **_: object) -> None:
-        """There is no value estimator."""
-
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The loss and its diagnostics, each a scalar, of a batch of pairs."""
-        accepted = self.tensor_keys
-        tokens = torch.cat((tensordict[accepted.preferred], tensordict[accepted.unpreferred]), 1)
-        valid = tensordict[accepted.token_valid]
-        batch = TensorDict(
-            {CONTEXT: tensordict[accepted.context], keys.TOKENS: tokens, keys.TOKEN_VALID: valid},
-            batch_size=tokens.shape[:1],
+    def _by_agent(self, preferred: Tensor, unpreferred: Tensor, say: Tensor) -> Comparison:
+        """Scores ``[S, M, A]`` of agents and what each says ``[S, M, A]``."""
+        agrees, counts = say > 0, say != 0
+        logit = self._logit(preferred.where(agrees, unpreferred), unpreferred.where(agrees, preferred))
+        cost = self._smooth("cost", logit).where(counts, logit.new_zeros(()))
+        return Comparison(
+            cost.sum(-1) / counts.sum(-1).clamp(min=1), logit.detach(), self._smooth("weight", logit.detach()), counts
         )
-        with self.actor_network_params.to_module(self.actor_network):
-            logits = self.actor_network(batch)[LOGITS]
-        log_prob = token_log_prob(logits, tokens)
-        gain, drift = log_prob, {}
-        if self.reference:
-            with torch.no_grad(), self.target_actor_network_params.to_module(self.actor_network):
-                reference = self.actor_network(batch.select(CONTEXT, keys.TOKENS, keys.TOKEN_VALID))[LOGITS]
-            gain = log_prob - token_log_prob(reference, tokens)
-            drift = {"kl": scene_mean(_divergence(logits.detach(), reference), valid)}
-        preferred, unpreferred = (self.alpha * self._reduce(gain, valid)).chunk(2, 1)
-        logit = preferred - self.conservative * unpreferred
-        nll, nll_unpreferred = (scene_mean(-side, valid) for side in log_prob.chunk(2, 1))
-        out = {"loss_preference": F.softplus(-logit).mean(), "loss_cloning": self.cloning * nll}
-        with torch.no_grad():
-            likelier = torch.gt(*self._reduce(log_prob, valid).chunk(2, 1))
-            out |= _pair_diagnostics(logit.detach())
-            out |= {"pair_accuracy": likelier.to(logit.dtype).mean(), "nll_preferred": nll.detach()}
-            out |= {"nll_unpreferred": nll_unpreferred.detach(), "entropy": scene_mean(_entropy(logits), valid)}
-            out |= drift
-        return TensorDict(out, batch_size=[])
 
-    def _reduce(self, value: Tensor, valid: Tensor) -> Tensor:
-        """``[S, M, A, T]`` to the score ``[S, M]`` of each rollout, without alpha."""
-        valid = valid.expand_as(value)
-        total = value.where(valid, value.new_zeros(())).sum((-1, -2))
-        if self.score_reduction == "sum":
-            return total
-        count = valid.any(-1).sum(-1) if self.score_reduction == "agent_mean" else valid.sum((-1, -2))
-        return total / count.clamp(min=1)
+    def _say(self, tensordict: TensorDictBase, side: Side) -> Tensor:
+        """``[S, M, A]``; an agent without tokens has no say."""
+        key = self.tensor_keys.agent_preference
+        say = tensordict.get(key, None)
+        if say is None:
+            raise ValueError(
+                f"credit='agent' reads {key!r}, which the batch lacks; give pairs of rollouts ranked by a distance of "
+                "each agent, or say credit='scene'."
+            )
+        return say * side.valid.any(-1)
 
+    def _logit(self, preferred: Tensor, unpreferred: Tensor) -> Tensor:
+        return preferred - self.conservative * unpreferred - self.margin
 
-def _pair_diagnostics(logit: Tensor) -> dict[str, Tensor]:
-    weight = torch.sigmoid(-logit)  # how strongly a pair pulls: the derivative of its loss
-    saturated = (weight < SATURATED) | (weight > 1 - SATURATED)
-    return {
-        "logit_mean": logit.mean(),
-        "logit_std": logit.std(correction=0),
-        "weight_mean": weight.mean(),
-        "saturated": saturated.to(logit.dtype).mean(),
-    }
-
-
-def _entropy(logits: Tensor) -> Tensor:
-    log_probs = logits.log_softmax(-1)
-    return -(log_probs.exp() * log_probs).sum(-1)
-
-
-def _divergence(logits: Tensor, reference: Tensor) -> Tensor:
-    """KL(pi || pi_ref) of each token's distribution [nats]."""
-    log_probs = logits.log_softmax(-1)
-    return (log_probs.exp() * (log_probs - reference.log_softmax(-1))).sum(-1)
+    def _smooth(self, what: Literal["cost", "weight"], logit: Tensor) -> Tensor:
+        """Cost or weight if each pair is the wrong way round with probability ``label_smoothing``."""
+        curve, sign = getattr(LINKS[self.link], what), 1 if what == "cost" else -1
+        return (1 - self.label_smoothing) * curve(logit) + sign * self.label_smoothing * curve(-logit)

@@ -49,3 +49,15 @@ def scene_mean(value: Tensor, mask: Tensor) -> Tensor:
 def token_log_prob(logits: Tensor, tokens: Tensor) -> Tensor:
     """Log-probability of each token [nats]: ``[..., V]`` and ``[...]`` to ``[...]``."""
     return logits.log_softmax(-1).gather(-1, tokens[..., None])[..., 0]
+
+
+def token_entropy(logits: Tensor) -> Tensor:
+    """Entropy of each token's distribution [nats]: ``[..., V]`` to ``[...]``."""
+    log_probs = logits.log_softmax(-1)
+    return -(log_probs.exp() * log_probs).sum(-1)
+
+
+def token_divergence(logits: Tensor, reference: Tensor) -> Tensor:
+    """KL(pi || pi_ref) of each token's distribution [nats]: twice ``[..., V]`` to ``[...]``."""
+    log_probs = logits.log_softmax(-1)
+    return (log_probs.exp() * (log_probs - reference.log_softmax(-1))).sum(-1)

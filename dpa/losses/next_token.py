@@ -9,7 +9,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictParams, dispatch
 from torchrl.objectives import LossModule
 
-from dpa.losses.network import CONTEXT, LOGITS, masked_mean
+from dpa.losses.network import CONTEXT, LOGITS, masked_mean, token_entropy
 from envs import keys
 
 
@@ -102,6 +102,6 @@ class NextTokenLoss(LossModule):
         loss = masked_mean((1 - self.label_smoothing) * nll + self.label_smoothing * spread, valid)
         with torch.no_grad():
             hit = (logits.argmax(-1) == labels).to(logits.dtype)
-            entropy = -(log_probs.exp() * log_probs).sum(-1)
-            diagnostics = {"accuracy": masked_mean(hit, valid), "entropy": masked_mean(entropy, valid)}
+            entropy = masked_mean(token_entropy(logits), valid)
+            diagnostics = {"accuracy": masked_mean(hit, valid), "entropy": entropy}
         return TensorDict({"loss_next_token": loss, **diagnostics}, batch_size=[])

@@ -1,0 +1,73 @@
+"""Notices when a preference loss no longer weighs preferences, and says what to change (METHOD section 5)."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+WINDOW = 10
+"""Steps that the share of saturated pairs is averaged over."""
+TOO_MANY = 0.5
+"""Share of saturated pairs above which the loss says who happened to be likely, rather than who is preferred."""
+
+
+class SaturationWatch:
+    """Gives one warning, once, when most of what a step compares is saturated.
+
+    At the first step of a run, where the policy is still its reference, that step alone decides: what saturates
+    there does so by the options. Later the mean of the last :data:`WINDOW` steps does.
+
+    Args:
+        options: of the loss; ``alpha``, ``score_reduction`` and ``reference`` are read where it has them.
+
+    Examples:
+        >>> watch = SaturationWatch({"alpha": 1.0, "reference": True, "score_reduction": "token_mean"})
+        >>> print(watch(0, {"saturated": 0.75, "logit_mean": 3.0, "logit_std": 4.0}))
+        75 % of the pairs are saturated since step 1: their weight follows how likely their rollouts are, not how
+        clear the preference is. Lower method.loss.alpha=1.0 to 0.2.
+    """
+
+    def __init__(self, options: Mapping[str, Any]) -> None:
+        self.options = options
+        self._steps: deque[tuple[int, float]] = deque(maxlen=WINDOW)
+        self._warned = False
+
+    def __call__(self, step: int, figures: Mapping[str, Any]) -> str | None:
+        """Take in one step.
+
+        Args:
+            step: counted from 0.
+            figures: what the loss returned for the step; one without ``saturated`` (imitation) is never told off.
+
+        Returns:
+            The warning, or None.
+        """
+        if self._warned or "saturated" not in figures:
+            return None
+        self._steps.append((step, float(figures["saturated"])))
+        share = sum(value for _, value in self._steps) / len(self._steps)
+        if share <= TOO_MANY or (step > 0 and len(self._steps) < WINDOW):
+            return None
+        self._warned = True
+        return (
+            f"{100 * share:.0f} % of the pairs are saturated since step {self._steps[0][0] + 1}: their weight follows "
+            f"how likely their rollouts are, not how clear the preference is. {self._advice(figures)}."
+        )
+
+    def _advice(self, figures: Mapping[str, Any]) -> str:
+        ways = []
+        if self.options.get("reference") is False:
+            ways.append("say method.loss.reference=true")
+        if self.options.get("score_reduction") != "token_mean":
+            ways.append("say method.loss.score_reduction=token_mean")
+        if "alpha" in self.options:
+            ways.append(f"lower method.loss.alpha={self.options['alpha']} to {self._smaller_alpha(figures):g}")
+        text = ", or ".join(ways) or "make its scores smaller"
+        return text[0].upper() + text[1:]
+
+    def _smaller_alpha(self, figures: Mapping[str, Any]) -> float:
+        """With which logits would be of size 1 (scores are proportional to alpha), to one digit."""
+        size = math.hypot(float(figures["logit_mean"]), float(figures["logit_std"]))
+        return float(f"{self.options['alpha'] / max(size, 1.0):.1g}")
