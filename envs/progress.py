@@ -118,3 +118,20 @@ def progress(
         ncols=None if terminal else 100,
         dynamic_ncols=terminal,
     )
+
+
+def message(text: str, stream: TextIO | None = None) -> None:
+    """Say one thing above the bars, without tearing them.
+
+    Args:
+        text: one line or several.
+        stream: where the bars go; standard error by default.
+
+    Examples:
+        >>> import io
+        >>> log = io.StringIO()
+        >>> message("lower the learning rate", log)
+        >>> log.getvalue().splitlines()
+        ['lower the learning rate']
+    """
+    tqdm.write(text, file=stream or sys.stderr)

@@ -9,38 +9,50 @@ again to go on after a kill.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import hydra
-import torch
 from numpy import nanmean
 from omegaconf import DictConfig
-from tensordict import TensorDict
 from torchrl.objectives import LossModule
 
-from dpa.losses import ContrastivePreferenceLoss, NextTokenLoss, token_network
+from dpa.losses import (
+    ContrastivePreferenceLoss,
+    KahnemanTverskyLoss,
+    NextTokenLoss,
+    PlackettLuceLoss,
+    SaturationWatch,
+    token_network,
+)
 from dpa.policy import ContextOptions, MotionLM
 from dpa.preferences import PreferenceStore
 from dpa.report.figures import read_curves
-from dpa.training.batches import Item, ShuffledOrder, collate_items, micro_batches
+from dpa.training.batches import ShuffledOrder
 from dpa.training.distributed import ALONE, Ranks, join_ranks
 from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
 from dpa.training.run import Run
 from dpa.training.seeding import seed_everything
-from envs import keys
+from envs.progress import message
 from envs.seeding import make_generator
 from envs.store import SceneStore
-from recipes.candidates import Group, make_candidates
+from recipes.candidates import SIDES, make_candidates
 from recipes.cli import CONFIG, build, check_steps, finished, finite, plain, ranked_recipe, write_json
+from recipes.draws import parts_of
 from recipes.likelihoods import PROBED, make_probes, probe
 from recipes.models import open_policy, weights_digest, write_policy
 from recipes.rankings import open_preferences
 from recipes.scenes import open_splits
 
-LOSSES: dict[str, type[LossModule]] = {"contrastive": ContrastivePreferenceLoss, "next_token": NextTokenLoss}
+LOSSES: dict[str, type[LossModule]] = {
+    "contrastive": ContrastivePreferenceLoss,
+    "kahneman_tversky": KahnemanTverskyLoss,
+    "plackett_luce": PlackettLuceLoss,
+    "next_token": NextTokenLoss,
+}
 """Losses that a method's YAML can name."""
+FITS = {"pairs": ("pairs",), "sets": ("pairs", "sets"), "ranking": ("ranking",), "targets": ("targets",)}
+"""What a loss can read, by its ``sides``: pairs may be read as two sets."""
 
 
 class Watch(NamedTuple):
@@ -88,6 +100,7 @@ def align(
     Raises:
         ValueError: preferences of other scenes or of another policy, an unknown loss, or options that do not fit it.
     """
+    check_fit(method)
     options, path, result = cfg.alignment, folder / "policy.pt", folder / "result.json"
     ranks.share_of(options.scenes_per_step, "alignment.scenes_per_step")
     device = ranks.place(cfg.device)
@@ -115,6 +128,7 @@ def align(
     loss = ranks.wrap(make_loss(method.loss, model.to(device).train()))
     optimizer = make_optimizer(model, options.lr, options.weight_decay)
     schedule = make_schedule(optimizer, options.steps, options.warmup)
+    saturation = SaturationWatch(method.loss)
     order = ShuffledOrder(len(candidates), options.scenes_per_step, seed)
     run = Run(
         folder,
@@ -138,6 +152,8 @@ def align(
             ranks.seed_dropout(seed, step)
             losses = accumulate_gradients(loss, parts_of(groups, options, draw, device, ranks), ranks)
             norm = clip_and_step(optimizer, options.max_norm, schedule)
+            if (warning := saturation(step, losses)) and ranks.main:
+                message(warning)
             run.log({f"train/{key}": value for key, value in losses.items()} | {"train/gradient_norm": norm})
             if ranks.main and step + 1 in options.snapshots:
                 write_policy(folder / f"step_{step + 1}" / "policy.pt", model, config, described | {"step": step + 1})
@@ -184,33 +200,21 @@ def make_loss(section: DictConfig, model: MotionLM) -> LossModule:
     return build(LOSSES[section.kind], DictConfig(options), f"method.loss ({section.kind})", token_network(model))
 
 
-def parts_of(
-    groups: list[Group], options: DictConfig, draw: torch.Generator, device: str, ranks: Ranks = ALONE
-) -> Iterator[tuple[TensorDict, float]]:
-    """Drawn pairs (or targets) of scenes of similar size as batches, each with its share of the step.
+def check_fit(method: DictConfig) -> None:
+    """Refuse a loss that would misread what the method learns from; a loss that has no ``sides`` takes anything.
 
-    A contrastive loss is a mean over pairs, of which each scene gives as many; imitation is a mean over tokens. All
-    ranks draw for all scenes of the step, so that the pairs do not depend on their number, and each passes its own.
+    Raises:
+        ValueError: for instance a ranking loss for pairs.
     """
-    chosen = [torch.randperm(len(group.preferred), generator=draw)[: options.pairs_per_scene] for group in groups]
-    weights = [1 if group.unpreferred is not None else int(group.token_valid.sum()) for group in groups]
-    mine = ranks.mine(range(len(groups)))
-    for part in micro_batches([len(groups[i].token_valid) * options.pairs_per_scene for i in mine], options.max_rows):
-        share = sum(weights[mine[i]] for i in part) / sum(weights)
-        yield make_batch([(groups[mine[i]], chosen[mine[i]]) for i in part]).to(device), share
-
-
-def make_batch(chosen: list[tuple[Group, torch.Tensor]]) -> TensorDict:
-    """A batch of some pairs (or targets) of each of some scenes.
-
-    Pairs become ``preferred`` and ``unpreferred``, targets ``tokens``; a method has the one or the other.
-    """
-    batch = collate_items([Item(group.context, group.preferred[rows], group.token_valid) for group, rows in chosen])
-    if chosen[0][0].unpreferred is not None:
-        other = [Item(group.context, group.unpreferred[rows], group.token_valid) for group, rows in chosen]
-        batch.rename_key_(keys.TOKENS, keys.PREFERRED)
-        batch[keys.UNPREFERRED] = collate_items(other)[keys.TOKENS]
-    return batch
+    wanted = getattr(LOSSES.get(method.loss.kind), "sides", None)
+    given = SIDES.get(method.data.kind)
+    if wanted is None or given is None or given in FITS[wanted]:
+        return
+    kinds = [kind for kind, sides in SIDES.items() if sides in FITS[wanted]]
+    raise ValueError(
+        f"method.loss.kind={method.loss.kind} learns from {wanted}, and method.data.kind={method.data.kind} gives "
+        f"{given}; say method.data.kind={' or '.join(kinds)}, or another loss."
+    )
 
 
 @hydra.main(**CONFIG, config_name="align")

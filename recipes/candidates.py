@@ -1,4 +1,4 @@
-"""What each method learns from: pairs or targets, drawn from a preference store (METHOD section 6)."""
+"""What each method learns from: pairs, sets, rankings or targets, out of a preference store (METHOD section 6)."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ from typing import NamedTuple
 
 import torch
 from omegaconf import DictConfig
+from tensordict import TensorDict
 from torch import Tensor
 
 from dpa.policy import ContextOptions, SceneContext, collate_contexts
 from dpa.policy.actor import Contexts
 from dpa.preferences import (
     PreferenceStore,
+    agent_preference,
     all_pairs,
     nearest,
     nearest_farthest,
@@ -33,21 +35,43 @@ class Group(NamedTuple):
     Attributes:
         context: uncollated.
         preferred: ``[M, A, T]`` tokens.
-        unpreferred: ``[M, A, T]`` tokens, pair by pair; None for a method that only imitates.
+        unpreferred: ``[N, A, T]`` tokens; None for a method that only imitates.
         token_valid: ``[A, T]`` bool, the same for both sides, so that nothing but the motion tells them apart.
+        agent_preference: ``[M, A]`` int64 of pairs, see :func:`~dpa.preferences.agent_preference`; None where agents
+            have no distance of their own.
+        sides: how the two sides belong together, one of the values of :data:`SIDES`.
     """
 
     context: SceneContext
     preferred: Tensor
     unpreferred: Tensor | None
     token_valid: Tensor
+    agent_preference: Tensor | None = None
+    sides: str = "pairs"
 
 
 Candidates = list[Group]
-DATA = ("pairs", "best", "adversarial")
-"""Ways to learn from a ranked group; see ``config/method``."""
+SIDES = {
+    "pairs": "pairs",
+    "best": "targets",
+    "sets": "sets",
+    "ranking": "ranking",
+    "adversarial": "pairs",
+    "expert": "pairs",
+}
+"""Ways to learn from the rollouts of a scene (``config/method``), and what each gives: M pairs, M targets to imitate,
+two sets of any sizes, or one ranking, whose nearer half is the preferred side and the rest the unpreferred one."""
+RANKED = ("pairs", "best", "sets", "ranking")
+"""Those of them that read ranks."""
 PAIRS = ("nearest_farthest", "random", "all")
 """Ways to pair the rollouts of a group."""
+
+
+class Chosen(NamedTuple):
+    """Rollouts of one scene's group: indices ``[M]`` and ``[N]``."""
+
+    preferred: Tensor
+    unpreferred: Tensor
 
 
 def make_candidates(
@@ -57,77 +81,96 @@ def make_candidates(
     options: ContextOptions,
     tokenizer: MotionTokenizer,
     seed: int,
+    expert: PreferenceStore | None = None,
 ) -> Candidates:
     """Candidates of every scene of a store.
 
     Args:
-        data: ``kind`` (one of :data:`DATA`), ``rank_by`` (``distance`` or ``ade``; not for adversarial) and ``num``:
-            pairs or targets of a scene. For pairs also ``pairs`` (one of :data:`PAIRS`; ``all`` takes no ``num``),
-            ``margin`` (share of the scene's mean distance by which the sides of a pair differ at least) and
-            ``rankings_per_scene`` (pairs that are kept of a scene in the mean, see
-            :func:`~dpa.preferences.pairs.thin_out`; None keeps all).
+        data: ``kind`` (one of :data:`SIDES`), ``rank_by`` (``distance`` or ``ade``; for :data:`RANKED` ones) and
+            ``num``: pairs, targets or rollouts of a scene.
+
+            - pairs: also ``pairs`` (one of :data:`PAIRS`; ``all`` takes no ``num``), ``margin`` (share of the scene's
+              mean distance by which the sides of a pair differ at least) and ``rankings_per_scene`` (pairs kept of a
+              scene in the mean, see :func:`~dpa.preferences.pairs.thin_out`; None keeps all);
+            - sets: ``num`` nearest rollouts against ``num_unpreferred`` farthest ones;
+            - ranking: ``num`` rollouts spread evenly over the ranks, None for all.
         store: ranked rollouts.
         scenes: that they are of.
         options: how scenes are cut up.
         tokenizer: for the tokens of logs.
         seed: of everything that is drawn.
+        expert: rollouts of an expert in the same scenes and tokens, the preferred side of ``kind: expert``.
 
     Returns:
         Scenes that no pair is left of, or no token, are not among them.
 
     Raises:
-        ValueError: an unknown kind, ranking or way to pair, more pairs than the groups hold, or no pair is left.
+        ValueError: an unknown kind, ranking or way to pair, more rollouts than the groups hold, no pair is left, or
+            no store of an expert that fits.
     """
     _check(data, store)
+    if data.kind == "expert":
+        expert = _check_expert(data, store, expert)
     contexts = Contexts(scenes, options)
-    chosen = _choose_pairs(data, store, seed) if data.kind == "pairs" else None
+    chosen = _choose(data, store, seed)
     groups = []
     for row, scene in enumerate(store.scenes.tolist()):
-        if chosen is not None and not len(chosen[row][0]):
+        if not len(chosen[row].preferred):
             continue
         context = contexts[scene]
-        ranked = store.read([row], num_agents=len(context.kind))
-        tokens, valid = ranked[keys.TOKENS][0], ranked[keys.TOKEN_VALID][0]
-        if chosen is not None:
-            preferred, unpreferred = chosen[row]
-            groups.append(Group(context, tokens[preferred], tokens[unpreferred], valid))
-        elif data.kind == "best":
-            groups.append(Group(context, tokens[nearest(ranked[data.rank_by], data.num)[0]], None, valid))
-        else:
-            drawn = random_rollouts(1, len(tokens), data.num, make_generator(seed, "adversarial", scene))[0]
+        ranked = store.read([row], num_agents=len(context.kind))[0]
+        group = _group(data, context, ranked, chosen[row])
+        if data.kind == "adversarial":
             log = log_item(context, tokenizer)
-            groups.append(Group(context, log.tokens.expand(data.num, -1, -1), tokens[drawn], log.token_valid & valid))
+            group = _against(group, log.tokens.expand(data.num, -1, -1), log.token_valid)
+        elif data.kind == "expert":
+            played = expert.read([_row_of(expert, scene)], num_agents=len(context.kind))[0]
+            drawn = random_rollouts(
+                1, len(played[keys.TOKENS]), data.num, make_generator(seed, "expert_rollouts", scene)
+            )[0]
+            group = _against(group, played[keys.TOKENS][drawn], played[keys.TOKEN_VALID])
+        groups.append(group)
     return [group for group in groups if group.token_valid.any()]
 
 
-def _check(data: DictConfig, store: PreferenceStore) -> None:
-    """Refuse options before any work."""
-    if data.kind not in DATA:
-        raise ValueError(f"method.data.kind must be one of {', '.join(DATA)}, got {data.kind!r}.")
-    if data.kind != "adversarial" and data.rank_by not in (keys.DISTANCE, keys.ADE):
-        raise ValueError(f"method.data.rank_by must be distance or ade, got {data.rank_by!r}.")
-    if data.kind == "pairs" and data.pairs not in PAIRS:
-        raise ValueError(f"method.data.pairs must be one of {', '.join(PAIRS)}, got {data.pairs!r}.")
-    if data.kind == "pairs" and data.pairs == "all":
-        if data.num is not None:
-            raise ValueError(
-                f"method.data.pairs=all takes every pair, and method.data.num={data.num} asks for some; say "
-                "method.data.num=null, and rankings_per_scene to keep fewer."
-            )
-        return
-    if not isinstance(data.num, int):
-        raise ValueError(f"method.data.num must be a whole number, got {data.num!r}.")
-    needed, held = data.num * (2 if data.kind == "pairs" else 1), store.provenance.num_rollouts
-    if not data.num > 0 or needed > held:
-        raise ValueError(
-            f"method.data.num={data.num} needs {needed} rollouts of a scene and the store holds {held}; lower it, or "
-            "collect again with a larger collection.num_rollouts."
-        )
+def _group(data: DictConfig, context: SceneContext, ranked: TensorDict, chosen: Chosen) -> Group:
+    """Chosen rollouts of one scene's own group."""
+    tokens, valid, say = ranked[keys.TOKENS], ranked[keys.TOKEN_VALID], None
+    # Displacement is kept of rollouts as a whole: agents have a preference by the distance only.
+    if data.kind == "pairs" and data.rank_by == keys.DISTANCE:
+        say = agent_preference(ranked[keys.AGENT_DISTANCE][None], *(side[None] for side in chosen))[0]
+    unpreferred = None if data.kind == "best" else tokens[chosen.unpreferred]
+    return Group(context, tokens[chosen.preferred], unpreferred, valid, say, SIDES[data.kind])
 
 
-def _choose_pairs(data: DictConfig, store: PreferenceStore, seed: int) -> list[tuple[Tensor, Tensor]]:
-    """Preferred and unpreferred rollouts ``[M]`` of every scene, M of its own."""
+def _against(group: Group, preferred: Tensor, token_valid: Tensor) -> Group:
+    """The group with its preferred side from elsewhere, under the mask that both have in common."""
+    return group._replace(preferred=preferred, token_valid=group.token_valid & token_valid)
+
+
+def _choose(data: DictConfig, store: PreferenceStore, seed: int) -> list[Chosen]:
+    """Rollouts of every scene of the store; M and N may differ among scenes for pairs only."""
+    if data.kind not in RANKED:
+        held = store.provenance.num_rollouts
+        draws = [make_generator(seed, data.kind, scene) for scene in store.scenes.tolist()]
+        rows = [random_rollouts(1, held, data.num, draw)[0] for draw in draws]
+        return [Chosen(drawn, drawn) for drawn in rows]
     distance = store.distance if data.rank_by == keys.DISTANCE else store.ade
+    if data.kind == "pairs":
+        return _choose_pairs(data, distance, seed)
+    order = nearest(distance, distance.shape[-1])
+    if data.kind == "best":
+        sides = order[:, : data.num], order[:, :0]
+    elif data.kind == "sets":
+        sides = order[:, : data.num], order[:, -data.num_unpreferred :].flip(-1)
+    else:
+        held = order.shape[-1]
+        ranks = torch.linspace(0, held - 1, data.num or held, dtype=torch.float64).round().long()
+        sides = order[:, ranks].tensor_split([(len(ranks) + 1) // 2], dim=1)
+    return [Chosen(*rows) for rows in zip(*sides, strict=True)]
+
+
+def _choose_pairs(data: DictConfig, distance: Tensor, seed: int) -> list[Chosen]:
     if data.pairs == "nearest_farthest":
         preferred, unpreferred = nearest_farthest(distance, data.num)
     elif data.pairs == "random":
@@ -142,7 +185,76 @@ def _choose_pairs(data: DictConfig, store: PreferenceStore, seed: int) -> list[t
         )
     if data.rankings_per_scene is not None:
         kept = thin_out(kept, data.rankings_per_scene, make_generator(seed, "rankings"))
-    return [(near[rows], far[rows]) for near, far, rows in zip(preferred, unpreferred, kept, strict=True)]
+    return [Chosen(near[rows], far[rows]) for near, far, rows in zip(preferred, unpreferred, kept, strict=True)]
+
+
+def _check(data: DictConfig, store: PreferenceStore) -> None:
+    """Refuse options before any work."""
+    if data.kind not in SIDES:
+        raise ValueError(f"method.data.kind must be one of {', '.join(SIDES)}, got {data.kind!r}.")
+    if data.kind in RANKED and data.rank_by not in (keys.DISTANCE, keys.ADE):
+        raise ValueError(f"method.data.rank_by must be distance or ade, got {data.rank_by!r}.")
+    if data.kind == "pairs" and data.pairs not in PAIRS:
+        raise ValueError(f"method.data.pairs must be one of {', '.join(PAIRS)}, got {data.pairs!r}.")
+    if data.kind == "pairs" and data.pairs == "all":
+        if data.num is not None:
+            raise ValueError(
+                f"method.data.pairs=all takes every pair, and method.data.num={data.num} asks for some; say "
+                "method.data.num=null, and rankings_per_scene to keep fewer."
+            )
+        return
+    if data.kind == "ranking" and data.num is None:
+        return
+    for name in ("num", "num_unpreferred") if data.kind == "sets" else ("num",):
+        if not isinstance(data[name], int):
+            raise ValueError(f"method.data.{name} must be a whole number, got {data[name]!r}.")
+        if data[name] < 1:
+            raise ValueError(f"method.data.{name} must be 1 or more, got {data[name]}.")
+    _check_enough(data, store)
+
+
+def _check_enough(data: DictConfig, store: PreferenceStore) -> None:
+    held, asked, needed = store.provenance.num_rollouts, f"method.data.num={data.num}", data.num
+    if data.kind == "pairs":
+        needed *= 2
+    elif data.kind == "sets":
+        asked, needed = f"{asked} and num_unpreferred={data.num_unpreferred}", needed + data.num_unpreferred
+    elif data.kind == "ranking" and data.num < 2:
+        raise ValueError(f"a ranking needs two rollouts, got {asked}; say 2 or more, or null for all.")
+    if needed > held:
+        raise ValueError(
+            f"{asked} needs {needed} rollouts of a scene and the store holds {held}; lower it, or collect again with a "
+            "larger collection.num_rollouts."
+        )
+
+
+def _check_expert(data: DictConfig, store: PreferenceStore, expert: PreferenceStore | None) -> PreferenceStore:
+    """The store of the expert, if it speaks of the same scenes in the same tokens."""
+    if expert is None:
+        raise ValueError("method.data.kind=expert needs rollouts of an expert, and there are none; give their store.")
+    for name in ("scenes", "horizon", "vocab_size"):
+        mine, other = getattr(store.provenance, name), getattr(expert.provenance, name)
+        if mine != other:
+            raise ValueError(
+                f"{expert.folder} has {name} {other} and {store.folder} {mine}; let the expert roll out the same "
+                "scenes with the same tokens."
+            )
+    if data.num > expert.provenance.num_rollouts:
+        raise ValueError(
+            f"method.data.num={data.num} needs as many rollouts of the expert and {expert.folder} holds "
+            f"{expert.provenance.num_rollouts} of a scene; lower it, or collect again."
+        )
+    missing = sorted(set(store.scenes.tolist()) - set(expert.scenes.tolist()))
+    if missing:
+        raise ValueError(
+            f"{expert.folder} lacks {len(missing)} scenes of {store.folder}, scene {missing[0]} first; collect with "
+            "the expert until it has all."
+        )
+    return expert
+
+
+def _row_of(store: PreferenceStore, scene: int) -> int:
+    return int((store.scenes == scene).nonzero()[0])
 
 
 @torch.no_grad()

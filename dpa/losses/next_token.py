@@ -67,6 +67,8 @@ class NextTokenLoss(LossModule):
     actor_network: TensorDictModule
     actor_network_params: TensorDictParams
     target_actor_network_params: TensorDictParams
+    sides = "targets"
+    """It imitates one side; see :attr:`~dpa.losses.PreferenceLoss.sides`."""
     out_keys = ["loss_next_token", "accuracy", "entropy"]
 
     def __init__(self, actor_network: TensorDictModule, *, label_smoothing: float = 0.0) -> None:

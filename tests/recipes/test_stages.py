@@ -30,9 +30,9 @@ from envs.scene import CURRENT_STEP
 from envs.sources.synthetic import straight_road
 from envs.store import SceneStore
 from recipes import evaluate as evaluation
-from recipes.align import parts_of
 from recipes.candidates import Group, make_candidates, pair_accuracy
 from recipes.cli import CONFIG
+from recipes.draws import parts_of
 from recipes.evaluate import SCENE_FIGURES, standing_moved
 from recipes.models import open_policy
 from recipes.partial import PartialResult
