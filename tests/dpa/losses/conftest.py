@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
+from torchrl.objectives import LossModule
 
 from dpa.losses import token_network
 from dpa.policy import SceneContext, collate_contexts, make_context
@@ -30,17 +33,19 @@ def table(agents: int = 2, horizon: int = 3, seed: int = 0) -> Table:
     return Table(torch.randn(agents, horizon, TOKENS, generator=generator))
 
 
-def pairs(agents: int = 2, horizon: int = 3, scenes: int = 1, num: int = 2, seed: int = 1) -> TensorDict:
-    """Pairs of random rollouts; the last agent leaves after the first decision."""
+def pairs(
+    agents: int = 2, horizon: int = 3, scenes: int = 1, num: int = 2, seed: int = 1, num_unpreferred: int | None = None
+) -> TensorDict:
+    """Sides of random rollouts; the last agent leaves after the first decision."""
     generator = torch.Generator().manual_seed(seed)
-    shape = (scenes, num, agents, horizon)
+    shape, other = (scenes, num, agents, horizon), (scenes, num_unpreferred or num, agents, horizon)
     valid = torch.ones(scenes, 1, agents, horizon, dtype=torch.bool)
     valid[:, :, -1, 1:] = False
     return TensorDict(
         {
             "context": collate_contexts([make_context(straight_road(agents))] * scenes),
             "preferred": torch.randint(TOKENS, shape, generator=generator),
-            "unpreferred": torch.randint(TOKENS, shape, generator=generator),
+            "unpreferred": torch.randint(TOKENS, other, generator=generator),
             "token_valid": valid,
         },
         batch_size=[scenes],
@@ -52,6 +57,25 @@ def network():
     """The table as the network of a loss, and its logits."""
     module = table()
     return token_network(module), module.logits.detach().clone()
+
+
+@pytest.fixture
+def trained(network: tuple) -> Callable[[LossModule], Tensor]:
+    """Moves the logits of a loss's policy, as some training does, and gives the new ones."""
+
+    def train(loss: LossModule) -> Tensor:
+        now = network[1] + torch.randn(network[1].shape, generator=torch.Generator().manual_seed(3))
+        with torch.no_grad():
+            loss.actor_network_params["module", "logits"].copy_(now)
+        return now
+
+    return train
+
+
+@pytest.fixture
+def make_batch() -> Callable[..., TensorDict]:
+    """:func:`pairs`."""
+    return pairs
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import warnings
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -13,41 +14,25 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from dpa.losses import ContrastivePreferenceLoss, token_network
+from dpa.losses.contrastive import LINKS
 from dpa.policy import MotionLM, collate_contexts, make_context
 from dpa.tokens import VerletTokenizer
 from dpa.training.checkpoint import capture
 from envs.sources.synthetic import straight_road
+from tests.dpa.losses.by_hand import SHARE, TOKENS_OF_A_ROLLOUT, gain, log_likelihood, sigmoid
 
 REDUCTIONS = ("sum", "agent_mean", "token_mean")
-VALID = [(0, 0), (0, 1), (0, 2), (1, 0)]
-"""(agent, decision) of the batch's valid tokens."""
-TOKENS_OF_A_ROLLOUT, AGENTS = len(VALID), 2
-
-
-def log_likelihood(logits: Tensor, tokens: Tensor) -> float:
-    """Of one rollout's valid tokens ``[A, T]``, one at a time."""
-    total = 0.0
-    for agent, step in VALID:
-        row = logits[agent, step].tolist()
-        total += row[tokens[agent, step]] - math.log(sum(math.exp(x) for x in row))
-    return total
 
 
 def by_hand(
     logits: Tensor, batch: TensorDict, *, alpha: float, conservative: float, reference: Tensor | None, reduction: str
 ) -> tuple[float, list[float]]:
     """The mean loss over pairs, and the logit of every pair."""
-    share = {"sum": 1.0, "agent_mean": 1 / AGENTS, "token_mean": 1 / TOKENS_OF_A_ROLLOUT}[reduction]
     pairs = []
-    for preferred, unpreferred in zip(batch["preferred"][0], batch["unpreferred"][0], strict=True):
-        scores = []
-        for tokens in (preferred, unpreferred):
-            score = log_likelihood(logits, tokens)
-            if reference is not None:
-                score -= log_likelihood(reference, tokens)
-            scores.append(alpha * share * score)
+    for preferred, unpreferred in zip(*sides(batch), strict=True):
+        scores = [alpha * SHARE[reduction] * gain(logits, reference, tokens) for tokens in (preferred, unpreferred)]
         pairs.append(scores[0] - conservative * scores[1])
-    losses = [-math.log(1 / (1 + math.exp(-logit))) for logit in pairs]
+    losses = [-math.log(sigmoid(logit)) for logit in pairs]
     return sum(losses) / len(losses), pairs
 
 
@@ -97,82 +82,12 @@ def test_with_a_reference_every_pair_starts_with_the_same_weight(
     assert out["saturated"].item() == 0 and out["kl"].item() == pytest.approx(0, abs=1e-6)
 
 
-def test_diagnostics_are_means_over_valid_tokens(network: tuple, batch: TensorDict) -> None:
-    actor, logits = network
-    out = ContrastivePreferenceLoss(actor)(batch)
-    for name, side in zip(("nll_preferred", "nll_unpreferred"), sides(batch), strict=True):
-        expected = -sum(log_likelihood(logits, tokens) for tokens in side) / (2 * TOKENS_OF_A_ROLLOUT)
-        assert out[name].item() == pytest.approx(expected, abs=1e-5)
-    probs = logits.softmax(-1)
-    entropy = -(probs * probs.log()).sum(-1)
-    assert out["entropy"].item() == pytest.approx(sum(entropy[a, t].item() for a, t in VALID) / len(VALID), abs=1e-5)
-
-
-def test_the_divergence_is_measured_from_the_reference(network: tuple, batch: TensorDict) -> None:
-    actor, start = network
-    loss = ContrastivePreferenceLoss(actor)
-    now = start + torch.randn(start.shape, generator=torch.Generator().manual_seed(3))
-    with torch.no_grad():
-        loss.actor_network_params["module", "logits"].copy_(now)
-    divergence = (now.softmax(-1) * (now.log_softmax(-1) - start.log_softmax(-1))).sum(-1)
-    expected = sum(divergence[a, t].item() for a, t in VALID) / len(VALID)
-    assert loss(batch)["kl"].item() == pytest.approx(expected, abs=1e-5)
-
-
 def test_pairs_far_apart_are_saturated(network: tuple, batch: TensorDict) -> None:
     actor, logits = network
     out = ContrastivePreferenceLoss(actor, alpha=100.0, reference=False)(batch)
     _, pairs = by_hand(logits, batch, alpha=100.0, conservative=1.0, reference=None, reduction="sum")
     assert all(abs(logit) > math.log(99) for logit in pairs)
     assert out["saturated"].item() == 1
-
-
-def test_the_cloning_term_is_the_likelihood_of_the_preferred_rollouts(network: tuple, batch: TensorDict) -> None:
-    out = ContrastivePreferenceLoss(network[0], cloning=0.3)(batch)
-    assert out["loss_cloning"].item() == pytest.approx(0.3 * out["nll_preferred"].item(), abs=1e-6)
-    assert ContrastivePreferenceLoss(network[0])(batch)["loss_cloning"].item() == 0
-
-
-@pytest.mark.parametrize("reference", [True, False])
-@pytest.mark.parametrize("reduction", REDUCTIONS)
-def test_tokens_that_are_not_valid_do_not_matter(
-    network: tuple, batch: TensorDict, reduction: str, reference: bool
-) -> None:
-    loss = ContrastivePreferenceLoss(network[0], reference=reference, score_reduction=reduction, cloning=1.0)
-    other = batch.clone()
-    for side in ("preferred", "unpreferred"):
-        other[side][..., -1, 1:] = (other[side][..., -1, 1:] + 1) % 5
-    assert (loss(batch) == loss(other)).all()
-    loss(batch)["loss_preference"].backward()
-    assert (loss.actor_network_params["module", "logits"].grad[-1, 1:] == 0).all()
-
-
-@pytest.mark.parametrize("reduction", REDUCTIONS)
-def test_a_step_makes_preferred_rollouts_likelier_and_unpreferred_ones_less_likely(
-    network: tuple, batch: TensorDict, reduction: str
-) -> None:
-    loss = ContrastivePreferenceLoss(network[0], score_reduction=reduction)
-    optimizer = torch.optim.SGD(loss.parameters(), lr=0.5)
-    before = loss(batch)
-    before["loss_preference"].backward()
-    optimizer.step()
-    after = loss(batch)
-    assert after["loss_preference"] < before["loss_preference"]
-    assert after["nll_preferred"] < before["nll_preferred"]
-    assert after["nll_unpreferred"] > before["nll_unpreferred"]
-    assert after["kl"] > 0
-
-
-def test_the_reference_stays_as_it_is(network: tuple, batch: TensorDict) -> None:
-    actor, start = network
-    loss = ContrastivePreferenceLoss(actor, cloning=1.0)
-    optimizer = torch.optim.SGD(loss.parameters(), lr=0.5)
-    for _ in range(3):
-        out = loss(batch)
-        (out["loss_preference"] + out["loss_cloning"]).backward()
-        optimizer.step()
-    assert torch.equal(loss.target_actor_network_params["module", "logits"], start)
-    assert not torch.equal(loss.actor_network_params["module", "logits"], start)
 
 
 def test_a_frozen_reference_is_no_missing_update(network: tuple, batch: TensorDict) -> None:
@@ -183,43 +98,144 @@ def test_a_frozen_reference_is_no_missing_update(network: tuple, batch: TensorDi
         assert loss.target_actor_network_params is not None
 
 
-def test_the_reference_is_no_parameter_to_train(network: tuple) -> None:
-    for reference in (True, False):
-        loss = ContrastivePreferenceLoss(network[0], reference=reference)
-        assert sum(parameter.requires_grad for parameter in loss.parameters()) == 1
+# --- links ----------------------------------------------------------------------------------------------------------
+def logits_of(now: Tensor, start: Tensor | None, batch: TensorDict, alpha: float) -> list[float]:
+    """Of the pairs, lambda 1, plain sums."""
+    return by_hand(now, batch, alpha=alpha, conservative=1.0, reference=start, reduction="sum")[1]
+
+
+def test_the_squared_link_is_ipo_up_to_a_factor(network: tuple, batch: TensorDict, trained: Callable) -> None:
+    actor, start = network
+    beta = 0.3
+    loss = ContrastivePreferenceLoss(actor, link="squared", alpha=beta)
+    now = trained(loss)
+    gaps = [h / beta for h in logits_of(now, start, batch, beta)]  # of log ratios, as Azar et al. write them
+    ipo = sum((gap - 1 / (2 * beta)) ** 2 for gap in gaps) / 2
+    out = loss(batch)
+    assert out["loss_preference"].item() == pytest.approx(beta**2 * ipo, rel=1e-5)
+    assert out["weight_mean"].item() == pytest.approx(sum(1 - 2 * beta * gap for gap in gaps) / 2, abs=1e-5)
+
+
+def test_label_smoothing_is_conservative_dpo(network: tuple, batch: TensorDict, trained: Callable) -> None:
+    actor, start = network
+    loss = ContrastivePreferenceLoss(actor, alpha=0.5, label_smoothing=0.2)
+    logits = logits_of(trained(loss), start, batch, 0.5)
+    costs = [-0.8 * math.log(sigmoid(h)) - 0.2 * math.log(sigmoid(-h)) for h in logits]
+    out = loss(batch)
+    assert out["loss_preference"].item() == pytest.approx(sum(costs) / 2, abs=1e-5)
+    assert out["weight_mean"].item() == pytest.approx(sum(sigmoid(-h) - 0.2 for h in logits) / 2, abs=1e-5)
+
+
+def test_token_means_without_a_reference_and_a_margin_are_simpo(network: tuple, batch: TensorDict) -> None:
+    actor, logits = network
+    loss = ContrastivePreferenceLoss(actor, reference=False, score_reduction="token_mean", alpha=2.0, margin=0.7)
+    costs = []
+    for preferred, unpreferred in zip(*sides(batch), strict=True):
+        per_token = [log_likelihood(logits, tokens) / TOKENS_OF_A_ROLLOUT for tokens in (preferred, unpreferred)]
+        costs.append(-math.log(sigmoid(2.0 * (per_token[0] - per_token[1]) - 0.7)))
+    assert loss(batch)["loss_preference"].item() == pytest.approx(sum(costs) / 2, abs=1e-5)
+
+
+def test_the_hinge_pulls_only_those_that_are_not_ahead_by_one(
+    network: tuple, batch: TensorDict, trained: Callable
+) -> None:
+    actor, start = network
+    loss = ContrastivePreferenceLoss(actor, link="hinge", alpha=1.5)
+    logits = logits_of(trained(loss), start, batch, 1.5)
+    assert min(logits) < 1 < max(logits), "one on either side"
+    out = loss(batch)
+    assert out["loss_preference"].item() == pytest.approx(sum(max(0.0, 1 - h) for h in logits) / 2, abs=1e-5)
+    assert out["weight_mean"].item() == 0.5
+
+
+@pytest.mark.parametrize("link", sorted(LINKS))
+def test_a_weight_is_the_slope_of_the_cost(link: str) -> None:
+    logit = torch.linspace(-3, 3, 12, requires_grad=True)
+    LINKS[link].cost(logit).sum().backward()
+    torch.testing.assert_close(LINKS[link].weight(logit.detach()), -logit.grad)
+
+
+def test_pairs_of_unequal_sides_are_refused(network: tuple, make_batch: Callable) -> None:
+    with pytest.raises(ValueError, match="as many preferred as unpreferred rollouts of a scene, got 2 and 3"):
+        ContrastivePreferenceLoss(network[0])(make_batch(num=2, num_unpreferred=3))
+
+
+# --- credit by agent ------------------------------------------------------------------------------------------------
+def by_agents(now: Tensor, start: Tensor, batch: TensorDict, say: list[list[int]], conservative: float) -> list[float]:
+    """What each pair costs with alpha 1: the mean over its agents that have a say."""
+    costs = []
+    for preferred, unpreferred, voices in zip(*sides(batch), say, strict=True):
+        terms = []
+        for agent, voice in enumerate(voices):
+            better, worse = (preferred, unpreferred) if voice > 0 else (unpreferred, preferred)
+            logit = gain(now, start, better, agent) - conservative * gain(now, start, worse, agent)
+            terms += [-math.log(sigmoid(logit))] if voice else []
+        costs.append(sum(terms) / max(len(terms), 1))
+    return costs
+
+
+@pytest.mark.parametrize("conservative", [1.0, 0.5])
+@pytest.mark.parametrize("say", [[[1, 1], [1, 1]], [[1, -1], [-1, 0]], [[0, 1], [0, 0]]])
+def test_each_agent_is_compared_in_its_own_direction(
+    network: tuple, batch: TensorDict, trained: Callable, say: list[list[int]], conservative: float
+) -> None:
+    actor, start = network
+    loss = ContrastivePreferenceLoss(actor, credit="agent", alpha=1.0, conservative=conservative)
+    now = trained(loss)
+    out = loss(batch.set("agent_preference", torch.tensor([say])))
+    expected = by_agents(now, start, batch, say, conservative)
+    assert out["loss_preference"].item() == pytest.approx(sum(expected) / 2, abs=1e-5)
+
+
+def test_an_agent_without_a_say_gets_no_gradient(network: tuple, batch: TensorDict) -> None:
+    loss = ContrastivePreferenceLoss(network[0], credit="agent")
+    loss(batch.set("agent_preference", torch.tensor([[[0, 1], [0, -1]]])))["loss_preference"].backward()
+    gradient = loss.actor_network_params["module", "logits"].grad
+    assert (gradient[0] == 0).all() and (gradient[1, 0] != 0).any()
+
+
+def test_where_nobody_has_a_say_nothing_is_learnt(network: tuple, batch: TensorDict) -> None:
+    loss = ContrastivePreferenceLoss(network[0], credit="agent")
+    out = loss(batch.set("agent_preference", torch.zeros(1, 2, 2, dtype=torch.int64)))
+    out["loss_preference"].backward()
+    assert out["loss_preference"].item() == 0 and out["logit_std"].item() == 0
+    assert (loss.actor_network_params["module", "logits"].grad == 0).all()
+
+
+def test_an_agent_without_tokens_has_no_say(network: tuple, batch: TensorDict) -> None:
+    batch["token_valid"][:, :, 1] = False
+    loss = ContrastivePreferenceLoss(network[0], credit="agent")
+    outs = [loss(batch.set("agent_preference", torch.tensor([[[1, v], [1, v]]])))["loss_preference"] for v in (0, 1)]
+    assert outs[0] == outs[1]
+
+
+def test_agents_that_agree_with_a_pair_of_their_own_are_the_pair(network: tuple, batch: TensorDict) -> None:
+    batch["token_valid"][:, :, 1] = False  # one agent: the scene is the agent
+    whole = ContrastivePreferenceLoss(network[0], reference=False)(batch)
+    alone = ContrastivePreferenceLoss(network[0], reference=False, credit="agent")(
+        batch.set("agent_preference", torch.tensor([[[1, 0], [1, 0]]]))
+    )
+    assert alone["loss_preference"].item() == pytest.approx(whole["loss_preference"].item(), abs=1e-6)
+    assert alone["logit_mean"].item() == pytest.approx(whole["logit_mean"].item(), abs=1e-6)
+
+
+def test_credit_by_agent_without_preferences_of_agents_is_told(network: tuple, batch: TensorDict) -> None:
+    with pytest.raises(ValueError, match="credit='agent' reads 'agent_preference', which the batch lacks"):
+        ContrastivePreferenceLoss(network[0], credit="agent")(batch)
+
+
+def test_preferences_of_agents_may_have_another_key(network: tuple, batch: TensorDict) -> None:
+    loss, say = ContrastivePreferenceLoss(network[0], credit="agent"), torch.tensor([[[1, -1], [0, 1]]])
+    expected = loss(batch.clone().set("agent_preference", say))
+    loss.set_keys(agent_preference=("data", "say"))
+    assert ("data", "say") in loss.in_keys
+    assert (loss(batch.set(("data", "say"), say)) == expected).all()
 
 
 # --- keys -----------------------------------------------------------------------------------------------------------
-def test_keys_can_be_set_to_nested_ones(network: tuple, batch: TensorDict) -> None:
-    loss = ContrastivePreferenceLoss(network[0])
-    expected = loss(batch)
-    renamed = {name: ("data", "pairs", name) for name in ("context", "preferred", "unpreferred", "token_valid")}
-    nested = TensorDict({key: batch[name] for name, key in renamed.items()}, batch_size=batch.batch_size)
-    loss.set_keys(**renamed)
-    assert loss.in_keys == list(renamed.values())
-    assert (loss(nested) == expected).all()
-
-
 def test_a_key_that_does_not_exist_is_refused(network: tuple) -> None:
     with pytest.raises(ValueError, match="winner"):
         ContrastivePreferenceLoss(network[0]).set_keys(winner="preferred")
-
-
-def test_plain_tensors_can_be_given_instead_of_a_tensordict(network: tuple, batch: TensorDict) -> None:
-    loss = ContrastivePreferenceLoss(network[0])
-    expected = loss(batch)
-    values = loss(**{name: batch[name] for name in ("context", "preferred", "unpreferred", "token_valid")})
-    assert len(values) == len(loss.out_keys)
-    for name, value in zip(loss.out_keys, values, strict=True):
-        assert torch.equal(value, expected[name])
-
-
-@pytest.mark.parametrize("reference", [True, False])
-def test_out_keys_are_what_comes_out(network: tuple, batch: TensorDict, reference: bool) -> None:
-    loss = ContrastivePreferenceLoss(network[0], reference=reference)
-    out = loss(batch)
-    assert set(out.keys()) == set(loss.out_keys)
-    assert {key for key in out.keys() if out[key].requires_grad} == {"loss_preference", "loss_cloning"}
 
 
 def test_the_input_stays_as_it_is(network: tuple, batch: TensorDict) -> None:
@@ -258,11 +274,13 @@ def test_it_trains_a_motion_model() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"alpha": 0.0}, "alpha must be positive, got 0.0"),
         ({"conservative": 0.0}, r"lambda\) must lie in \(0, 1\], got 0.0"),
         ({"conservative": 1.5}, "got 1.5"),
-        ({"score_reduction": "mean"}, "'sum', 'agent_mean' or 'token_mean', got 'mean'"),
-        ({"cloning": -0.1}, "cloning must not be negative, got -0.1"),
+        ({"link": "cubic"}, "link must be 'logistic', 'squared' or 'hinge', got 'cubic'"),
+        ({"credit": "step"}, "credit must be 'scene' or 'agent', got 'step'"),
+        ({"margin": -1.0}, "margin must not be negative, got -1.0"),
+        ({"label_smoothing": 0.5}, r"label_smoothing must lie in \[0, 0.5\), got 0.5"),
+        ({"label_smoothing": -0.1}, "got -0.1"),
     ],
 )
 def test_options_outside_their_range_are_refused(

@@ -1,0 +1,69 @@
+"""SaturationWatch: when it speaks, once, and what it says."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from dpa.losses import SaturationWatch
+from dpa.losses.saturation import WINDOW
+
+PLAIN = {"alpha": 0.1, "reference": False, "score_reduction": "sum"}
+
+
+def figures(saturated: float, mean: float = 0.0, std: float = 10.0) -> dict[str, float]:
+    return {"saturated": saturated, "logit_mean": mean, "logit_std": std}
+
+
+def said(watch: SaturationWatch, shares: list[float], first: int = 0) -> dict[int, str]:
+    """Step -> warning."""
+    told = {step: watch(step, figures(share)) for step, share in enumerate(shares, first)}
+    return {step: text for step, text in told.items() if text}
+
+
+def test_the_first_step_alone_is_enough() -> None:
+    told = said(SaturationWatch(PLAIN), [0.6, 0.9, 0.9])
+    assert list(told) == [0]
+    assert told[0].startswith("60 % of the pairs are saturated since step 1:")
+
+
+def test_later_the_mean_of_the_last_steps_decides() -> None:
+    told = said(SaturationWatch(PLAIN), [0.0] * 5 + [1.0] * 30)
+    assert list(told) == [WINDOW], "five of ten are not more than half, six are"
+    assert told[WINDOW].startswith("60 % of the pairs are saturated since step 2:")
+
+
+def test_half_of_the_pairs_is_not_too_many() -> None:
+    assert not said(SaturationWatch(PLAIN), [0.5] * 30)
+
+
+def test_a_run_that_goes_on_waits_for_enough_steps() -> None:
+    told = said(SaturationWatch(PLAIN), [1.0] * 30, first=40)
+    assert list(told) == [40 + WINDOW - 1]
+
+
+def test_imitation_is_never_told_off() -> None:
+    watch = SaturationWatch({"label_smoothing": 0.0})
+    assert watch(0, {"loss_next_token": 2.0}) is None
+
+
+@pytest.mark.parametrize(
+    ("options", "mean", "std", "advice"),
+    [
+        (PLAIN, 0.0, 10.0, "Say method.loss.reference=true, or say method.loss.score_reduction=token_mean, or lower "
+         "method.loss.alpha=0.1 to 0.01."),
+        ({**PLAIN, "reference": True}, 3.0, 4.0, "Say method.loss.score_reduction=token_mean, or lower "
+         "method.loss.alpha=0.1 to 0.02."),
+        ({**PLAIN, "reference": True, "score_reduction": "token_mean"}, 50.0, 0.0, "Lower method.loss.alpha=0.1 to "
+         "0.002."),
+        ({"score_reduction": "token_mean"}, 0.0, 10.0, "Make its scores smaller."),
+    ],
+)  # fmt: skip
+def test_it_names_the_options_that_are_left_to_change(options: dict, mean: float, std: float, advice: str) -> None:
+    text = SaturationWatch(options)(0, figures(0.9, mean, std))
+    assert re.search(re.escape(advice) + "$", text)
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])
