@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import inspect
 import json
 import os
 import re
@@ -30,9 +32,10 @@ from envs.scene import CURRENT_STEP
 from envs.sources.synthetic import straight_road
 from envs.store import SceneStore
 from recipes import evaluate as evaluation
+from recipes.align import check_fit, make_loss
 from recipes.candidates import Group, make_candidates, pair_accuracy
-from recipes.cli import CONFIG
-from recipes.draws import parts_of
+from recipes.cli import CONFIG, plain
+from recipes.draws import draw_rows, make_batch, parts_of
 from recipes.evaluate import SCENE_FIGURES, standing_moved
 from recipes.models import open_policy
 from recipes.partial import PartialResult
@@ -220,14 +223,14 @@ def compose_recipe(recipe: str, options: Callable, runs: Path) -> DictConfig:
         return compose(recipe, options(recipe, f"policy={runs}", f"preferences={runs}"))
 
 
-def pairs_of(runs: Path, options: Callable, **data: object) -> list[Group]:
-    """Pairs of the preferences, with ``data`` over those of DPA-OMF."""
+def pairs_of(runs: Path, options: Callable, expert: PreferenceStore | None = None, **data: object) -> list[Group]:
+    """Candidates from the preferences, with ``data`` over those of DPA-OMF."""
     cfg = compose_recipe("align", options, runs)
     scenes = open_splits(cfg.scenes).train
     store = PreferenceStore(runs / "preferences")
     model, context, _ = open_policy(runs / "reference/policy.pt")
-    section = OmegaConf.merge(cfg.method.data, {"num": 2}, data)
-    return make_candidates(section, store, scenes, context, model.tokenizer, seed=0)
+    section = OmegaConf.merge(OmegaConf.create(plain(cfg.method.data)), {"num": 2}, data)
+    return make_candidates(section, store, scenes, context, model.tokenizer, seed=0, expert=expert)
 
 
 @pytest.mark.parametrize(
@@ -270,6 +273,13 @@ def test_a_margin_leaves_the_clear_pairs(runs: Path, options: Callable) -> None:
         ({"margin": 50.0}, "method.data.margin=50.0 leaves no pair"),
         ({"margin": -1.0}, "a margin is 0 or more"),
         ({"rankings_per_scene": 0}, "must be more than 0"),
+        ({"kind": "best", "num": 0}, "method.data.num must be 1 or more, got 0"),
+        ({"kind": "best", "num": 5}, "method.data.num=5 needs 5 rollouts of a scene and the store holds 4"),
+        ({"kind": "sets", "num_unpreferred": 3}, "num=2 and num_unpreferred=3 needs 5 rollouts"),
+        ({"kind": "sets", "num_unpreferred": None}, "num_unpreferred must be a whole number, got None"),
+        ({"kind": "ranking", "num": 1}, "a ranking needs two rollouts, got method.data.num=1"),
+        ({"kind": "expert"}, "needs rollouts of an expert, and there are none"),
+        ({"kind": "worst"}, "must be one of pairs, best, sets, ranking, adversarial, expert, got 'worst'"),
     ],
 )
 def test_options_that_give_no_pairs_are_told(
@@ -277,6 +287,104 @@ def test_options_that_give_no_pairs_are_told(
 ) -> None:
     with pytest.raises(ValueError, match=re.escape(message)):
         pairs_of(runs, options, **data)
+
+
+def ranks_of(runs: Path, row: int, tokens: torch.Tensor) -> list[int]:
+    """Rank of each rollout ``[M, A, T]`` within its scene's group."""
+    group = PreferenceStore(runs / "preferences").read([row], num_agents=tokens.shape[1])[0]
+    found = [(group[keys.TOKENS] == one).all(-1).all(-1).nonzero()[0, 0] for one in tokens]
+    return [int(group[keys.RANK][i]) for i in found]
+
+
+def test_sets_are_the_nearest_and_the_farthest_rollouts(runs: Path, options: Callable) -> None:
+    for row, group in enumerate(pairs_of(runs, options, kind="sets", num=1, num_unpreferred=2)):
+        assert group.sides == "sets"
+        assert ranks_of(runs, row, group.preferred) == [0] and ranks_of(runs, row, group.unpreferred) == [3, 2]
+
+
+@pytest.mark.parametrize(("num", "nearer", "farther"), [(None, [0, 1], [2, 3]), (3, [0, 2], [3]), (2, [0], [3])])
+def test_a_ranking_is_spread_over_the_ranks_nearest_first(
+    runs: Path, options: Callable, num: int | None, nearer: list[int], farther: list[int]
+) -> None:
+    for row, group in enumerate(pairs_of(runs, options, kind="ranking", num=num)):
+        assert group.sides == "ranking"
+        assert ranks_of(runs, row, group.preferred) == nearer and ranks_of(runs, row, group.unpreferred) == farther
+
+
+def test_pairs_ranked_by_distance_say_what_each_agent_prefers(runs: Path, options: Callable) -> None:
+    store = PreferenceStore(runs / "preferences")
+    for row, group in enumerate(pairs_of(runs, options)):
+        distance = store.read([row], num_agents=group.preferred.shape[1])[keys.AGENT_DISTANCE][0]
+        near, far = nearest_farthest(store.distance[row][None], 2)
+        assert torch.equal(group.agent_preference, (distance[far[0]] - distance[near[0]]).sign().long())
+    assert all(group.agent_preference is None for group in pairs_of(runs, options, rank_by="ade"))
+
+
+def test_rollouts_of_an_expert_stand_against_those_of_the_reference(runs: Path, options: Callable) -> None:
+    expert = PreferenceStore(runs / "preferences")
+    groups = pairs_of(runs, options, expert, kind="expert", num=4)
+    assert len(groups) == 6
+    for row, group in enumerate(groups):
+        every = expert.read([row], num_agents=group.preferred.shape[1])[keys.TOKENS][0].flatten(1).tolist()
+        for side in (group.preferred, group.unpreferred):
+            assert sorted(side.flatten(1).tolist()) == sorted(every), "all four of each, drawn without repetition"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"scenes": "elsewhere"}, "has scenes elsewhere and"),
+        ({"vocab_size": 200}, "has vocab_size 200 and"),
+        ({"num_rollouts": 1}, "needs as many rollouts of the expert and"),
+        ({}, "lacks 6 scenes of"),
+    ],
+)
+def test_an_expert_that_does_not_fit_is_told(
+    runs: Path, options: Callable, tmp_path: Path, change: dict, message: str
+) -> None:
+    origin = PreferenceStore(runs / "preferences").provenance
+    with PreferenceWriter(tmp_path / "expert", dataclasses.replace(origin, **change)):
+        pass
+    with pytest.raises(ValueError, match=message):
+        pairs_of(runs, options, PreferenceStore(tmp_path / "expert"), kind="expert")
+
+
+# --- draws ----------------------------------------------------------------------------------------------------------
+def numbered(num: int, num_unpreferred: int, sides: str, agents: int = 2) -> Group:
+    """Rollouts whose tokens are their row, the unpreferred ones from 100 on; agents' preferences are the row too."""
+    rows = torch.arange(num)[:, None, None].expand(-1, agents, 16)
+    others = 100 + torch.arange(num_unpreferred)[:, None, None].expand(-1, agents, 16)
+    valid = torch.ones(agents, 16, dtype=torch.bool)
+    say = rows[:, :, 0] if sides == "pairs" else None
+    return Group(make_context(straight_road(agents)), rows, others, valid, say, sides)
+
+
+def test_pairs_stay_pairs_and_agents_keep_their_say() -> None:
+    draw = torch.Generator().manual_seed(0)
+    groups = [numbered(6, 6, "pairs", agents) for agents in (2, 3)]
+    batch = make_batch([draw_rows(group, 3, draw) for group in groups])
+    first, second = batch[keys.PREFERRED][:, :, 0, 0], batch[keys.UNPREFERRED][:, :, 0, 0]
+    assert first.shape == (2, 3) and torch.equal(second, first + 100)
+    assert torch.equal(batch[keys.AGENT_PREFERENCE][1], first[1][:, None].expand(-1, 3))
+    assert torch.equal(batch[keys.AGENT_PREFERENCE][0, :, 2], torch.zeros(3, dtype=torch.int64)), "padding says nothing"
+
+
+@pytest.mark.parametrize(("num", "sizes"), [(1, (1, 2)), (2, (2, 4)), (3, (3, 6)), (9, (4, 8))])
+def test_sides_that_are_not_paired_are_drawn_apart_in_proportion(num: int, sizes: tuple[int, int]) -> None:
+    draw, seen = torch.Generator().manual_seed(0), set()
+    for _ in range(20):
+        drawn = draw_rows(numbered(4, 8, "sets"), num, draw)
+        assert (len(drawn.preferred), len(drawn.unpreferred)) == sizes
+        seen.add((tuple(drawn.preferred.tolist()), tuple(drawn.unpreferred.tolist())))
+    assert len(seen) > 4 or num == 9
+
+
+def test_what_is_drawn_of_a_ranking_is_a_ranking() -> None:
+    draw = torch.Generator().manual_seed(0)
+    for _ in range(20):
+        batch = make_batch([draw_rows(numbered(8, 8, "ranking"), 4, draw)])
+        order = torch.cat((batch[keys.PREFERRED], batch[keys.UNPREFERRED]), 1)[0, :, 0, 0]
+        assert len(order) == 8 and (order.diff() > 0).all()
 
 
 def test_a_step_asks_for_no_more_pairs_than_every_scene_has(
@@ -316,6 +424,61 @@ def test_every_method_aligns_the_reference(
     else:
         start = read_curve(tmp_path / method, "train/loss_preference")[0][1]
         assert start == pytest.approx(0.693147, abs=1e-5), "log 2: the policy starts as its own reference"
+
+
+@pytest.mark.parametrize(
+    ("method", "start"), [("kto", 0.5), ("listwise", 0.693147), ("ipo", 0.25), ("per_agent", 0.693147), ("simpo", None)]
+)
+def test_other_losses_align_the_reference(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path, method: str, start: float | None
+) -> None:
+    given = [f"method={method}", "method.data.num=2", f"output={tmp_path / method}"]
+    given += ["method.data.num_unpreferred=2"] if method == "kto" else []
+    given += [f"policy={runs / 'reference/policy.pt'}", f"preferences={runs / 'preferences'}"]
+    outcome = run("align", *options("align", *given))
+    assert outcome.status == 0, outcome.err
+    losses = [value for _, value in read_curve(tmp_path / method, "train/loss_preference")]
+    assert len(losses) == 4
+    assert start is None or losses[0] == pytest.approx(start, abs=1e-5), "the policy starts as its own reference"
+    assert not torch.equal(weights(tmp_path / method / "policy.pt"), weights(runs / "reference/policy.pt"))
+
+
+CONFIGURED = sorted(path.stem for path in Path(CONFIG["config_path"], "method").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("method", CONFIGURED)
+def test_the_loss_of_every_method_can_be_built_and_reads_its_data(method: str) -> None:
+    with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):
+        section = compose("align", [f"method={method}"]).method
+    assert section.name == method
+    check_fit(section)
+    loss = make_loss(section.loss, MotionLM("nano", VerletTokenizer()))
+    given = {key for key in section.loss if key != "kind"}
+    assert given == set(inspect.signature(type(loss)).parameters) - {"actor_network"}, "the YAML shows every option"
+
+
+@pytest.mark.parametrize(
+    ("loss", "data", "message"),
+    [
+        ("plackett_luce", "pairs", "plackett_luce learns from ranking, and method.data.kind=pairs gives pairs; say "
+         "method.data.kind=ranking, or another loss"),
+        ("contrastive", "sets", "gives sets; say method.data.kind=pairs or adversarial or expert"),
+        ("kahneman_tversky", "best", "gives targets; say method.data.kind=pairs or sets or adversarial or expert"),
+        ("next_token", "pairs", "next_token learns from targets"),
+    ],
+)  # fmt: skip
+def test_a_loss_that_would_misread_the_data_is_refused(loss: str, data: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        check_fit(OmegaConf.create({"loss": {"kind": loss}, "data": {"kind": data}}))
+
+
+def test_a_loss_that_saturates_is_told_once(run: Callable, options: Callable, runs: Path, tmp_path: Path) -> None:
+    given = ["method=cpl", "method.data.num=2", "method.loss.alpha=1000", f"output={tmp_path / 'cpl'}"]
+    given += [f"policy={runs / 'reference/policy.pt'}", f"preferences={runs / 'preferences'}"]
+    outcome = run("align", *options("align", *given))
+    assert outcome.status == 0, outcome.err
+    assert outcome.err.count("of the pairs are saturated since step 1:") == 1
+    assert "method.loss.reference=true" in outcome.err
 
 
 def test_a_step_is_the_same_however_it_is_split_into_parts() -> None:
