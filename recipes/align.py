@@ -3,8 +3,8 @@
     python -m recipes.align method=dpa_omf policy=runs/pretrain/policy.pt preferences=runs/preferences
     torchrun --nproc-per-node 2 -m recipes.align method=dpa_omf policy=FILE preferences=DIR  # docs/scale.md
 
-Methods differ in one YAML each: dpa_omf, dpa_adef, sft_best_oa, sft_best_ade, adversarial_afd. Run the same command
-again to go on after a kill.
+Methods differ in one YAML each: dpa_omf, dpa_adef, sft_best_oa, sft_best_ade, adversarial_afd, and others under
+``config/method``. Run the same command again to go on after a kill.
 """
 
 from __future__ import annotations

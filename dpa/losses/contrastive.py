@@ -52,7 +52,7 @@ class ContrastivePreferenceLoss(PreferenceLoss):
     logistic  softplus(-h)     CPL without a reference (eq. 4; Hejna et al. 2024), DPO with one (Rafailov
                                et al. 2023), SimPO with token means and a margin (Meng et al. 2024)
     squared   (h - 1/2)^2      IPO (Azar et al. 2024): alpha^2 times its ``(h / alpha - 1 / (2 alpha))^2``
-    hinge     max(0, 1 - h)    SLiC (Zhao et al. 2023)
+    hinge     max(0, 1 - h)    SLiC without a reference (Zhao et al. 2023)
     ========= ================ ==========================================================================
 
     The default starts with equal weights for all pairs, because both scores are 0. The plain sum without a reference

@@ -25,8 +25,8 @@ class KahnemanTverskyLoss(PreferenceLoss):
         actor_network: from :func:`~dpa.losses.token_network`.
 
     Keyword Args:
-        desirable_weight: w_D. For sides of different sizes the authors suggest ``w_D * M / (w_U * N)`` from 1 to 3/2,
-            with M preferred and N unpreferred rollouts.
+        desirable_weight: w_D. With M preferred and N unpreferred rollouts, both sides weigh alike where
+            ``w_D * M = w_U * N``.
         undesirable_weight: w_U.
         alpha: scale of a score; their beta.
         score_reduction: see :class:`~dpa.losses.PreferenceLoss`.
