@@ -10,22 +10,11 @@ Methods differ in one YAML each: dpa_omf, dpa_adef, sft_best_oa, sft_best_ade, a
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
 
 import hydra
-from numpy import nanmean
 from omegaconf import DictConfig
-from torchrl.objectives import LossModule
 
-from dpa.losses import (
-    ContrastivePreferenceLoss,
-    KahnemanTverskyLoss,
-    NextTokenLoss,
-    PlackettLuceLoss,
-    SaturationWatch,
-    token_network,
-)
-from dpa.policy import ContextOptions, MotionLM
+from dpa.losses import SaturationWatch
 from dpa.preferences import PreferenceStore
 from dpa.report.figures import read_curves
 from dpa.training.batches import ShuffledOrder
@@ -36,35 +25,14 @@ from dpa.training.seeding import seed_everything
 from envs.progress import message
 from envs.seeding import make_generator
 from envs.store import SceneStore
-from recipes.candidates import SIDES, make_candidates
-from recipes.cli import CONFIG, build, check_steps, finished, finite, plain, ranked_recipe, write_json
+from recipes.candidates import make_candidates
+from recipes.cli import CONFIG, check_steps, finished, finite, plain, ranked_recipe, write_json
 from recipes.draws import parts_of
-from recipes.likelihoods import PROBED, make_probes, probe
+from recipes.losses import check_fit, make_loss
 from recipes.models import open_policy, weights_digest, write_policy
 from recipes.rankings import open_preferences
 from recipes.scenes import open_splits
-
-LOSSES: dict[str, type[LossModule]] = {
-    "contrastive": ContrastivePreferenceLoss,
-    "kahneman_tversky": KahnemanTverskyLoss,
-    "plackett_luce": PlackettLuceLoss,
-    "next_token": NextTokenLoss,
-}
-"""Losses that a method's YAML can name."""
-FITS = {"pairs": ("pairs",), "sets": ("pairs", "sets"), "ranking": ("ranking",), "targets": ("targets",)}
-"""What a loss can read, by its ``sides``: pairs may be read as two sets."""
-
-
-class Watch(NamedTuple):
-    """Scenes that no loss sees, and ranked rollouts of them, to look at along the way.
-
-    Attributes:
-        scenes: tuning scenes.
-        preferences: folder of a store of ranked rollouts of them.
-    """
-
-    scenes: SceneStore
-    preferences: Path
+from recipes.watch import Look, Watch
 
 
 def align(
@@ -106,6 +74,7 @@ def align(
     device = ranks.place(cfg.device)
     model, context, config = open_policy(policy, device)
     store = open_preferences(preferences, scenes, model, policy)
+    played = None if expert is None else PreferenceStore(expert)
     decided_by = {
         "data": plain(method.data),
         "loss": plain(method.loss),
@@ -113,12 +82,12 @@ def align(
         "seed": seed,
         "reference": weights_digest(model),
         "ranking": store.provenance.ranking,
-        "expert": None if expert is None else PreferenceStore(expert).provenance.policy,
+        "expert": None if played is None else played.provenance.policy,
     }
     if ranks.agree(finished(result, decided_by) is not None and path.is_file(), "finished =", folder):
         return path
     seed_everything(seed)
-    candidates = make_candidates(method.data, store, scenes, context, model.tokenizer.cpu(), seed)
+    candidates = make_candidates(method.data, store, scenes, context, model.tokenizer.cpu(), seed, played)
     counts = {len(group.preferred) for group in candidates}
     if len(counts) > 1 and min(counts) < options.pairs_per_scene:
         raise ValueError(
@@ -165,56 +134,6 @@ def align(
         write_json(result, {"options": decided_by, "policy": str(path), "last_step": last})
     ranks.wait()
     return path
-
-
-class Look:
-    """A look at the policy in training: what it thinks of logs and rollouts of scenes that no loss sees.
-
-    Args:
-        watch: the scenes.
-        context: how scenes are cut up.
-        model: in training.
-        options: the section ``alignment``.
-    """
-
-    def __init__(self, watch: Watch, context: ContextOptions, model: MotionLM, options: DictConfig) -> None:
-        store = PreferenceStore(watch.preferences)
-        rows = range(min(options.watch_scenes, len(store)))
-        pairs = min(options.watch_pairs, store.provenance.num_rollouts // 2)
-        self.model, self.probes = model, make_probes(store, watch.scenes, context, model.tokenizer, pairs, rows)
-
-    def __call__(self, device: str) -> dict[str, float]:
-        """Means over the scenes, as curves are named."""
-        training = self.model.training
-        self.model.eval()
-        found = probe(self.model, self.probes, device)
-        self.model.train(training)
-        return {f"tune/{name}": nanmean([each[name] for each in found]) for name in PROBED}
-
-
-def make_loss(section: DictConfig, model: MotionLM) -> LossModule:
-    """The loss that a method names, around the model; a reference copy is the model as it is now."""
-    options = {key: value for key, value in section.items() if key != "kind"}
-    if section.kind not in LOSSES:
-        raise ValueError(f"method.loss.kind must be one of {sorted(LOSSES)}, got {section.kind!r}.")
-    return build(LOSSES[section.kind], DictConfig(options), f"method.loss ({section.kind})", token_network(model))
-
-
-def check_fit(method: DictConfig) -> None:
-    """Refuse a loss that would misread what the method learns from; a loss that has no ``sides`` takes anything.
-
-    Raises:
-        ValueError: for instance a ranking loss for pairs.
-    """
-    wanted = getattr(LOSSES.get(method.loss.kind), "sides", None)
-    given = SIDES.get(method.data.kind)
-    if wanted is None or given is None or given in FITS[wanted]:
-        return
-    kinds = [kind for kind, sides in SIDES.items() if sides in FITS[wanted]]
-    raise ValueError(
-        f"method.loss.kind={method.loss.kind} learns from {wanted}, and method.data.kind={method.data.kind} gives "
-        f"{given}; say method.data.kind={' or '.join(kinds)}, or another loss."
-    )
 
 
 @hydra.main(**CONFIG, config_name="align")

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 from torch import Tensor
 
-from dpa.policy import ContextOptions, SceneContext, collate_contexts
+from dpa.policy import ContextOptions, SceneContext
 from dpa.policy.actor import Contexts
 from dpa.preferences import (
     PreferenceStore,
@@ -87,7 +87,7 @@ def make_candidates(
 
     Args:
         data: ``kind`` (one of :data:`SIDES`), ``rank_by`` (``distance`` or ``ade``; for :data:`RANKED` ones) and
-            ``num``: pairs, targets or rollouts of a scene.
+            ``num``: pairs, targets or rollouts of a scene; a whole number of them, or a share of its rollouts below 1.
 
             - pairs: also ``pairs`` (one of :data:`PAIRS`; ``all`` takes no ``num``), ``margin`` (share of the scene's
               mean distance by which the sides of a pair differ at least) and ``rankings_per_scene`` (pairs kept of a
@@ -108,6 +108,7 @@ def make_candidates(
         ValueError: an unknown kind, ranking or way to pair, more rollouts than the groups hold, no pair is left, or
             no store of an expert that fits.
     """
+    data = _counted(data, store.provenance.num_rollouts)
     _check(data, store)
     if data.kind == "expert":
         expert = _check_expert(data, store, expert)
@@ -188,6 +189,15 @@ def _choose_pairs(data: DictConfig, distance: Tensor, seed: int) -> list[Chosen]
     return [Chosen(near[rows], far[rows]) for near, far, rows in zip(preferred, unpreferred, kept, strict=True)]
 
 
+def _counted(data: DictConfig, held: int) -> DictConfig:
+    """Shares of a scene's rollouts as whole numbers, at least one."""
+    shares = {name: data.get(name) for name in ("num", "num_unpreferred") if isinstance(data.get(name), float)}
+    for name, share in shares.items():
+        if not 0 < share < 1:
+            raise ValueError(f"method.data.{name} must be a whole number, or a share between 0 and 1, got {share}.")
+    return OmegaConf.merge(data, {name: max(1, round(share * held)) for name, share in shares.items()})
+
+
 def _check(data: DictConfig, store: PreferenceStore) -> None:
     """Refuse options before any work."""
     if data.kind not in SIDES:
@@ -207,7 +217,7 @@ def _check(data: DictConfig, store: PreferenceStore) -> None:
         return
     for name in ("num", "num_unpreferred") if data.kind == "sets" else ("num",):
         if not isinstance(data[name], int):
-            raise ValueError(f"method.data.{name} must be a whole number, got {data[name]!r}.")
+            raise ValueError(f"method.data.{name} must be a whole number, or a share between 0 and 1, got {data[name]!r}.")
         if data[name] < 1:
             raise ValueError(f"method.data.{name} must be 1 or more, got {data[name]}.")
     _check_enough(data, store)
@@ -255,20 +265,3 @@ def _check_expert(data: DictConfig, store: PreferenceStore, expert: PreferenceSt
 
 def _row_of(store: PreferenceStore, scene: int) -> int:
     return int((store.scenes == scene).nonzero()[0])
-
-
-@torch.no_grad()
-def pair_accuracy(model: torch.nn.Module, candidates: Candidates, device: str) -> float:
-    """Share of pairs whose preferred rollout is the more likely one under a model (METHOD table 3)."""
-    right = total = 0
-    for group in candidates:
-        scores = []
-        context = collate_contexts([group.context]).to(device)
-        valid = group.token_valid[None, None].to(device)
-        for tokens in (group.preferred, group.unpreferred):
-            tokens = tokens[None].to(device)
-            log_prob = model(context, tokens, valid).log_softmax(-1).gather(-1, tokens[..., None])[..., 0]
-            scores.append((log_prob * valid).sum((-1, -2))[0])
-        right += int((scores[0] > scores[1]).sum())
-        total += len(scores[0])
-    return right / max(total, 1)

@@ -12,7 +12,7 @@ from dpa.policy import Decoding
 from dpa.preferences import PreferenceStore
 from dpa.report.table import REFERENCE
 from envs.seeding import make_generator
-from recipes.align import Watch, align
+from recipes.align import align
 from recipes.cli import build, finished, finite, write_json
 from recipes.collect import collect
 from recipes.evaluate import evaluate
@@ -23,6 +23,7 @@ from recipes.pretrain import pretrain
 from recipes.rerank import rerank
 from recipes.runs import RunFolder
 from recipes.scenes import open_splits
+from recipes.watch import Watch
 
 
 def pretrain_job(cfg: DictConfig, seed: int) -> None:

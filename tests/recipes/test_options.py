@@ -248,6 +248,7 @@ def test_a_device_that_is_not_there_is_told_before_any_work(run: Callable, optio
 def test_more_pairs_than_rollouts_are_refused(run: Callable, options: Callable, runs: Path, tmp_path: Path) -> None:
     policy, store = runs / "reference/policy.pt", runs / "preferences"
     command = options("align", f"policy={policy}", f"preferences={store}", f"output={tmp_path / 'out'}")
+    command.append("method.data.num=8")
     assert_refused(run("align", *command), "method.data.num=8 needs 16 rollouts of a scene and the store holds 4")
 
 

@@ -32,11 +32,11 @@ from envs.scene import CURRENT_STEP
 from envs.sources.synthetic import straight_road
 from envs.store import SceneStore
 from recipes import evaluate as evaluation
-from recipes.align import check_fit, make_loss
-from recipes.candidates import Group, make_candidates, pair_accuracy
+from recipes.candidates import Group, make_candidates
 from recipes.cli import CONFIG, plain
 from recipes.draws import draw_rows, make_batch, parts_of
 from recipes.evaluate import SCENE_FIGURES, standing_moved
+from recipes.losses import check_fit, make_loss
 from recipes.models import open_policy
 from recipes.partial import PartialResult
 from recipes.pool import Job, Workers
@@ -269,14 +269,15 @@ def test_a_margin_leaves_the_clear_pairs(runs: Path, options: Callable) -> None:
     [
         ({"pairs": "some"}, "method.data.pairs must be one of nearest_farthest, random, all, got 'some'"),
         ({"pairs": "all"}, "method.data.num=2 asks for some; say method.data.num=null"),
-        ({"num": None}, "method.data.num must be a whole number, got None"),
+        ({"num": None}, "method.data.num must be a whole number, or a share between 0 and 1, got None"),
         ({"margin": 50.0}, "method.data.margin=50.0 leaves no pair"),
         ({"margin": -1.0}, "a margin is 0 or more"),
         ({"rankings_per_scene": 0}, "must be more than 0"),
         ({"kind": "best", "num": 0}, "method.data.num must be 1 or more, got 0"),
         ({"kind": "best", "num": 5}, "method.data.num=5 needs 5 rollouts of a scene and the store holds 4"),
         ({"kind": "sets", "num_unpreferred": 3}, "num=2 and num_unpreferred=3 needs 5 rollouts"),
-        ({"kind": "sets", "num_unpreferred": None}, "num_unpreferred must be a whole number, got None"),
+        ({"kind": "sets", "num_unpreferred": None}, "num_unpreferred must be a whole number, or a share between 0 and 1, got None"),
+        ({"num": 1.5}, "method.data.num must be a whole number, or a share between 0 and 1, got 1.5"),
         ({"kind": "ranking", "num": 1}, "a ranking needs two rollouts, got method.data.num=1"),
         ({"kind": "expert"}, "needs rollouts of an expert, and there are none"),
         ({"kind": "worst"}, "must be one of pairs, best, sets, ranking, adversarial, expert, got 'worst'"),
@@ -287,6 +288,13 @@ def test_options_that_give_no_pairs_are_told(
 ) -> None:
     with pytest.raises(ValueError, match=re.escape(message)):
         pairs_of(runs, options, **data)
+
+
+@pytest.mark.parametrize(("share", "number"), [(0.25, 1), (0.5, 2), (0.1, 1)])
+def test_a_share_of_the_rollouts_is_as_many_of_them(runs: Path, options: Callable, share: float, number: int) -> None:
+    mine, other = (pairs_of(runs, options, num=num) for num in (share, number))
+    for one, two in zip(mine, other, strict=True):
+        assert torch.equal(one.preferred, two.preferred) and torch.equal(one.unpreferred, two.unpreferred)
 
 
 def ranks_of(runs: Path, row: int, tokens: torch.Tensor) -> list[int]:
@@ -512,25 +520,6 @@ def shake(model: torch.nn.Module) -> None:
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.add_(0.05 * torch.randn(parameter.shape))
-
-
-class Scorer(torch.nn.Module):
-    """Gives token 1 the higher likelihood."""
-
-    def forward(self, context: object, tokens: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-        return torch.tensor([0.0, 1.0]).expand(*tokens.shape, 2)
-
-
-def test_pair_accuracy_is_the_share_of_pairs_whose_preferred_rollout_is_likelier() -> None:
-    context, valid = make_context(straight_road(2)), torch.ones(2, 16, dtype=torch.bool)
-    valid[1, 8:] = False
-    many, few = torch.ones(1, 2, 16, dtype=torch.int64), torch.zeros(1, 2, 16, dtype=torch.int64)
-    hidden = few.clone()
-    hidden[:, 1, 8:] = 1  # more of token 1, but only where it does not count
-    one, two, few_ones = torch.cat((many, few)), torch.cat((few, few)), few.clone()
-    few_ones[:, 0, 0] = 1
-    groups = [Group(context, one, two, valid), Group(context, few_ones, hidden, valid)]
-    assert pair_accuracy(Scorer(), groups, "cpu") == pytest.approx(2 / 3)
 
 
 # --- rank again -----------------------------------------------------------------------------------------------------

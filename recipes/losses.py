@@ -1,0 +1,52 @@
+"""The loss that a method's YAML names, and whether it can read what the method learns from."""
+
+from __future__ import annotations
+
+from omegaconf import DictConfig
+from torchrl.objectives import LossModule
+
+from dpa.losses import (
+    ContrastivePreferenceLoss,
+    KahnemanTverskyLoss,
+    NextTokenLoss,
+    PlackettLuceLoss,
+    token_network,
+)
+from dpa.policy import MotionLM
+from recipes.candidates import SIDES
+from recipes.cli import build
+
+LOSSES: dict[str, type[LossModule]] = {
+    "contrastive": ContrastivePreferenceLoss,
+    "kahneman_tversky": KahnemanTverskyLoss,
+    "plackett_luce": PlackettLuceLoss,
+    "next_token": NextTokenLoss,
+}
+"""Losses that a method's YAML can name."""
+FITS = {"pairs": ("pairs",), "sets": ("pairs", "sets"), "ranking": ("ranking",), "targets": ("targets",)}
+"""What a loss can read, by its ``sides``: pairs may be read as two sets."""
+
+
+def make_loss(section: DictConfig, model: MotionLM) -> LossModule:
+    """The loss that a method names, around the model; a reference copy is the model as it is now."""
+    options = {key: value for key, value in section.items() if key != "kind"}
+    if section.kind not in LOSSES:
+        raise ValueError(f"method.loss.kind must be one of {sorted(LOSSES)}, got {section.kind!r}.")
+    return build(LOSSES[section.kind], DictConfig(options), f"method.loss ({section.kind})", token_network(model))
+
+
+def check_fit(method: DictConfig) -> None:
+    """Refuse a loss that would misread what the method learns from; a loss that has no ``sides`` takes anything.
+
+    Raises:
+        ValueError: for instance a ranking loss for pairs.
+    """
+    wanted = getattr(LOSSES.get(method.loss.kind), "sides", None)
+    given = SIDES.get(method.data.kind)
+    if wanted is None or given is None or given in FITS[wanted]:
+        return
+    kinds = [kind for kind, sides in SIDES.items() if sides in FITS[wanted]]
+    raise ValueError(
+        f"method.loss.kind={method.loss.kind} learns from {wanted}, and method.data.kind={method.data.kind} gives "
+        f"{given}; say method.data.kind={' or '.join(kinds)}, or another loss."
+    )

@@ -1,0 +1,51 @@
+"""A look at a policy in training: scenes that no loss sees (METHOD figures 4 and 6)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from numpy import nanmean
+from omegaconf import DictConfig
+
+from dpa.policy import ContextOptions, MotionLM
+from dpa.preferences import PreferenceStore
+from envs.store import SceneStore
+from recipes.likelihoods import PROBED, make_probes, probe
+
+
+class Watch(NamedTuple):
+    """Scenes that no loss sees, and ranked rollouts of them, to look at along the way.
+
+    Attributes:
+        scenes: tuning scenes.
+        preferences: folder of a store of ranked rollouts of them.
+    """
+
+    scenes: SceneStore
+    preferences: Path
+
+
+class Look:
+    """A look at the policy in training: what it thinks of logs and rollouts of scenes that no loss sees.
+
+    Args:
+        watch: the scenes.
+        context: how scenes are cut up.
+        model: in training.
+        options: the section ``alignment``.
+    """
+
+    def __init__(self, watch: Watch, context: ContextOptions, model: MotionLM, options: DictConfig) -> None:
+        store = PreferenceStore(watch.preferences)
+        rows = range(min(options.watch_scenes, len(store)))
+        pairs = min(options.watch_pairs, store.provenance.num_rollouts // 2)
+        self.model, self.probes = model, make_probes(store, watch.scenes, context, model.tokenizer, pairs, rows)
+
+    def __call__(self, device: str) -> dict[str, float]:
+        """Means over the scenes, as curves are named."""
+        training = self.model.training
+        self.model.eval()
+        found = probe(self.model, self.probes, device)
+        self.model.train(training)
+        return {f"tune/{name}": nanmean([each[name] for each in found]) for name in PROBED}
