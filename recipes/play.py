@@ -1,6 +1,9 @@
 """Look at what policies do: a page that plays some scenes, log beside rollouts.
 
-python -m recipes.play policies=[runs/pretrain/policy.pt,runs/dpa_omf/policy.pt]
+    python -m recipes.play policies=[runs/pretrain/policy.pt,runs/dpa_omf/policy.pt]
+
+Of many rollouts of each scene and policy the page keeps a few: the most likely one, and some from the one nearest to
+the log to the farthest.
 """
 
 from __future__ import annotations
@@ -11,16 +14,24 @@ from pathlib import Path
 import hydra
 import torch
 from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from torch import Tensor
 
 from dpa.policy import Decoding
+from dpa.ranking import Distance, PreferenceDistance
+from dpa.report.judged import JudgedRollouts, judge_rollouts
 from dpa.report.page import write_rollouts
 from dpa.report.player import PlayerScene
-from dpa.rollout import make_collector, simulated_poses
+from dpa.rollout import make_collector
 from envs import keys
 from envs.store import SceneStore
 from recipes.cli import CONFIG, build, recipe
 from recipes.models import open_policy
+from recipes.rankings import build_distance
+from recipes.rolled import rolled
 from recipes.scenes import open_splits
+
+PAPER_DISTANCE = PreferenceDistance()
 
 
 def roll_out(
@@ -28,8 +39,10 @@ def roll_out(
     scenes: SceneStore,
     wanted: Sequence[int],
     *,
-    decoding: Decoding,
-    num_rollouts: int = 4,
+    decoding: Decoding | Mapping[str, Decoding],
+    num_rollouts: int = 64,
+    kept: int = 6,
+    distance: Distance = PAPER_DISTANCE,
     seed: int = 0,
     device: str = "cpu",
 ) -> list[PlayerScene]:
@@ -39,12 +52,19 @@ def roll_out(
         policies: name -> file.
         scenes: to roll out.
         wanted: indices of the scenes.
-        decoding: how tokens are drawn.
+        decoding: how tokens are drawn, by all policies alike or by each in a way of its own.
         num_rollouts: of each scene and policy.
+        kept: of these, from the nearest to the farthest; the most likely one may come on top.
+        distance: how rollouts are compared with the log.
         seed: of the sampling, the same for every policy.
         device: of the policies.
+
+    Raises:
+        ValueError: a distance that couples nothing, or a policy without a decoding.
     """
-    rollouts: dict[int, dict[str, torch.Tensor]] = {index: {} for index in wanted}
+    if not isinstance(distance, PreferenceDistance):
+        raise ValueError(f"the player shows couplings, and {distance} couples nothing; give kind: preference.")
+    judged: dict[int, dict[str, JudgedRollouts]] = {index: {} for index in wanted}
     for name, path in policies.items():
         model, context, _ = open_policy(path, device)
         batches = make_collector(
@@ -52,17 +72,51 @@ def roll_out(
             model,
             num_rollouts=num_rollouts,
             indices=wanted,
-            decoding=decoding,
+            decoding=_decoding_of(name, decoding),
             options=context,
             seed=seed,
             device=device,
         )
         for batch in batches:
-            poses = simulated_poses(batch, num_rollouts).cpu()
-            for row, index in enumerate(batch[keys.SCENE][::num_rollouts, 0].tolist()):
-                present = int(scenes[index].agents.present.sum())
-                rollouts[index][name] = poses[row, :, :present]
-    return [PlayerScene(scenes[index], rollouts[index]) for index in wanted]
+            likelihood = log_likelihood(batch, num_rollouts)
+            for row, each in enumerate(rolled([batch], scenes, num_rollouts)):
+                judged[each.index][name] = judge_rollouts(
+                    each.scene, each.trajectories, each.controlled, likelihood[row], distance, kept
+                )
+    return [PlayerScene(scenes[index], judged[index]) for index in wanted]
+
+
+def _decoding_of(name: str, decoding: Decoding | Mapping[str, Decoding]) -> Decoding:
+    if isinstance(decoding, Decoding):
+        return decoding
+    if name not in decoding:
+        raise ValueError(f"policy {name!r} has no decoding; there are some for {', '.join(decoding) or 'none'}.")
+    return decoding[name]
+
+
+def log_likelihood(batch: TensorDictBase, num_rollouts: int) -> Tensor:
+    """How likely rollouts are under the policy that made them, whatever distribution they were drawn from.
+
+    Args:
+        batch: of a collector, ``[S * K, T]``.
+        num_rollouts: K.
+
+    Returns:
+        ``[S, K]`` log-probability of a token at temperature 1, mean over the tokens of controlled agents [nats]; NaN
+        where there are none.
+
+    Examples:
+        >>> from dpa.policy import MotionLM
+        >>> from dpa.tokens import VerletTokenizer
+        >>> from envs.sources.synthetic import straight_road
+        >>> model = MotionLM("nano", VerletTokenizer())
+        >>> (batch,) = make_collector([straight_road(2)], model, num_rollouts=4)
+        >>> bool((log_likelihood(batch, 4) < 0).all())
+        True
+    """
+    counts = batch[keys.CONTROLLED] & batch[keys.VALID]
+    total = torch.where(counts, batch[keys.LOG_PROB].double(), 0).sum((1, 2))
+    return (total / counts.sum((1, 2))).float().view(-1, num_rollouts).cpu()
 
 
 def named(paths: Sequence[str]) -> dict[str, Path]:
@@ -102,11 +156,14 @@ def main(cfg: DictConfig) -> None:
         chosen_scenes(scenes, cfg.show),
         decoding=build(Decoding, cfg.decoding, "decoding"),
         num_rollouts=cfg.num_rollouts,
+        kept=cfg.kept,
+        distance=build_distance(cfg.ranking, "ranking"),
         seed=cfg.seed,
         device=cfg.device,
     )
     facts = {name: str(path) for name, path in policies.items()} | {
-        "decoding": f"top-p {cfg.decoding.top_p:g}, temperature {cfg.decoding.temperature:g}, seed {cfg.seed}"
+        "decoding": f"top-p {cfg.decoding.top_p:g}, temperature {cfg.decoding.temperature:g}, seed {cfg.seed}",
+        "rollouts": f"{cfg.num_rollouts} of each scene; {cfg.kept} from the nearest to the farthest, and the likeliest",
     }
     print(f"page: {write_rollouts(cfg.output, players, facts)}")
 

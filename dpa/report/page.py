@@ -170,7 +170,7 @@ def _player(players: Sequence[PlayerScene]) -> str:
     # Inside a script element only these could end it or open a comment; JSON may write any character as an escape.
     for character in "<>&":
         packed = packed.replace(character, f"\\u{ord(character):04x}")
-    return _filled("player.html", {"player_data": packed})
+    return _filled("player.html", {"player_data": packed, "player_script": _text("player.js")})
 
 
 def _facts(comparison: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -190,5 +190,8 @@ def _facts(comparison: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _filled(template: str, parts: Mapping[str, str]) -> str:
     """Fill a template's ``<!--{name}-->`` marks in one pass, so that what is put in is never searched for marks."""
-    text = resources.files("dpa.report").joinpath(template).read_text(encoding="utf-8")
-    return re.sub(r"<!--\{(\w+)\}-->", lambda mark: parts[mark[1]], text)
+    return re.sub(r"<!--\{(\w+)\}-->", lambda mark: parts[mark[1]], _text(template))
+
+
+def _text(name: str) -> str:
+    return resources.files("dpa.report").joinpath(name).read_text(encoding="utf-8")

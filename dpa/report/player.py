@@ -1,15 +1,17 @@
-"""Scenes and rollouts packed for the player of a report page: whole centimetres, each step against the last one."""
+"""Scenes and rollouts packed for the player of a report page; the player itself is ``player.html`` and ``player.js``."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
+import torch
 from torch import Tensor
 
+from dpa.report.judged import Couplings, JudgedRollouts, logged_mishaps
+from dpa.report.packing import pack_line, pack_numbers, pack_tracks, run_lengths, simplified, whole
 from envs.render import fit_view, pose_tracks, style
 from envs.scene import (
     CURRENT_STEP,
@@ -20,13 +22,9 @@ from envs.scene import (
     polylines,
 )
 
-CENTIMETRE = 0.01
-"""Unit of packed positions [m] and headings [rad]."""
 MAP_TOLERANCE = 0.1
 """How far a packed polyline may lie from its own points [m]; lanes come with a point each half metre."""
-
-Track = list[int | None]
-"""Poses of one agent: x, y, heading as differences from its last known pose (the first: from 0); None where absent."""
+_KINDS = (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST, AgentKind.OTHER, AgentKind.UNSET)
 
 
 @dataclass(frozen=True)
@@ -35,35 +33,37 @@ class PlayerScene:
 
     Attributes:
         scene: an uncollated scene.
-        rollouts: for each method ``[R, A', 80, 3]`` x, y, heading of the A' agents present at the current step, in
-            scene order; NaN where an agent is not there. Methods may have different R.
+        rollouts: of each method; methods may keep different numbers of them.
     """
 
     scene: Scene
-    rollouts: Mapping[str, Tensor]
+    rollouts: Mapping[str, JudgedRollouts]
 
 
 def pack_players(players: Sequence[PlayerScene]) -> dict[str, Any]:
     """Everything the player needs, as JSON can hold it.
 
+    Long rows of numbers are text, see :mod:`dpa.report.packing`. A scene of 40 agents takes about 20 kB for its log
+    and map, and as much for each rollout.
+
     Args:
         players: scenes with their rollouts.
 
+    Returns:
+        ``scenes`` in the order given, with ``rollouts`` of each method; and what holds for all of them.
+
     Raises:
-        ValueError: rollouts that do not fit their scene; the message names scene and method.
+        ValueError: rollouts that do not fit their scene, or a scene without road edges; the message names it.
 
     Examples:
-        >>> import torch
         >>> from envs.sources.synthetic import straight_road
-        >>> scene = straight_road(num_vehicles=2)
-        >>> packed = pack_players([PlayerScene(scene, {"reference": torch.zeros(1, 2, 80, 3)})])
-        >>> packed["scenes"][0]["log"][0][:6]  # 10 m/s to the right, from 10 m behind the origin
-        [-1000, -250, 0, 100, 0, 0]
+        >>> packed = pack_players([PlayerScene(straight_road(num_vehicles=2), {})])
+        >>> packed["scenes"][0]["agents"]
+        ['SDC 1', 'vehicle 2']
     """
-    kinds = [AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST, AgentKind.OTHER, AgentKind.UNSET]
     classes = [{"name": "SDC", "color": style.SDC_COLOR, "halo": False}] + [
         {"name": kind.name.capitalize(), "color": style.AGENT_COLORS[kind], "halo": kind in style.SMALL_KINDS}
-        for kind in kinds
+        for kind in _KINDS
     ]
     return {
         "steps": LOG_STEPS,
@@ -72,106 +72,89 @@ def pack_players(players: Sequence[PlayerScene]) -> dict[str, Any]:
         "ground": style.GROUND_COLOR,
         "classes": classes,
         "lights": {group: color for group, (_, color) in style.LIGHT_STYLE.items()},
-        "scenes": [_pack_scene(player, kinds) for player in players],
+        "scenes": [_pack_scene(player) for player in players],
     }
 
 
-def _pack_scene(player: PlayerScene, kinds: Sequence[AgentKind]) -> dict[str, Any]:
+def _pack_scene(player: PlayerScene) -> dict[str, Any]:
     scene, agents = player.scene, player.scene.agents
-    view = fit_view(scene)
+    collides, offroad = logged_mishaps(scene)
     return {
         "id": scene.scene_id,
-        "view": _whole(np.array(view)).tolist(),
+        "view": whole(torch.tensor(fit_view(scene)).numpy()).tolist(),
         "map": _pack_map(scene),
         "lights": _pack_lights(scene),
         "class": [
-            0 if sdc else 1 + kinds.index(AgentKind(kind))
+            0 if sdc else 1 + _KINDS.index(AgentKind(kind))
             for kind, sdc in zip(agents.kind.tolist(), agents.sdc.tolist(), strict=True)
         ],
-        "size": _whole(agents.extent[:, :2].numpy()).tolist(),
-        "log": pack_tracks(pose_tracks(scene)),
+        "agents": [
+            f"{'SDC' if sdc else AgentKind(kind).name.lower()} {track}"
+            for kind, sdc, track in zip(agents.kind.tolist(), agents.sdc.tolist(), agents.track_id.tolist(), strict=True)
+        ],
+        "size": whole(agents.extent[:, :2].numpy()).tolist(),
+        "log": {"tracks": pack_tracks(pose_tracks(scene)), **_pack_mishaps(collides, offroad)},
         "present": agents.present.nonzero()[:, 0].tolist(),
-        "rollouts": {method: _pack_rollouts(scene, method, given) for method, given in player.rollouts.items()},
+        "rollouts": {method: _pack_method(scene, method, judged) for method, judged in player.rollouts.items()},
     }
 
 
-def _pack_rollouts(scene: Scene, method: str, rollouts: Tensor) -> list[list[Track]]:
+def _pack_method(scene: Scene, method: str, judged: JudgedRollouts) -> dict[str, Any]:
     expected = (int(scene.agents.present.sum()), LOG_STEPS - CURRENT_STEP - 1, 3)
-    if rollouts.ndim != 4 or tuple(rollouts.shape[1:]) != expected or not len(rollouts):
+    if judged.poses.ndim != 4 or tuple(judged.poses.shape[1:]) != expected or not len(judged.poses):
         raise ValueError(
             f"scene {scene.scene_id}, method {method!r}: rollouts must be [R, A'={expected[0]}, {expected[1]}, 3] of "
-            f"the agents present at the current step, got {list(rollouts.shape)}."
+            f"the agents present at the current step, got {list(judged.poses.shape)}."
         )
-    return [pack_tracks(rollout) for rollout in rollouts.detach().cpu()]
+    return {
+        "sampled": judged.sampled,
+        "features": [name.replace("_", " ") for name in judged.couplings.features],
+        "stride": judged.couplings.stride,
+        "ranked": judged.couplings.agents.tolist(),
+        "kept": [_pack_rollout(judged, row) for row in range(len(judged.poses))],
+    }
 
 
-def pack_tracks(poses: Tensor) -> list[Track]:
-    """Pack poses ``[A, T, 3]`` (NaN where absent), one :data:`Track` for each agent.
+def _pack_rollout(judged: JudgedRollouts, row: int) -> dict[str, Any]:
+    couplings = judged.couplings
+    return {
+        "number": int(judged.number[row]),
+        "distance": round(float(judged.distance[row]), 3),
+        "nearer": int(judged.distance_rank[row]),
+        "nats": round(float(judged.log_likelihood[row]), 4),
+        "likelier": int(judged.likelihood_rank[row]),
+        "tracks": pack_tracks(judged.poses[row].detach().cpu()),
+        **_pack_mishaps(judged.collides[row], judged.offroad[row]),
+        "paid": [round(paid, 3) for paid in judged.agent_distance[row][couplings.agents].tolist()],
+        "share": pack_numbers((100 * couplings.share[row]).round().long().flatten().tolist()),
+        "coupling": [_pack_coupling(couplings, row, agent) for agent in range(len(couplings.agents))],
+    }
 
-    Differences are taken after rounding, so that adding them up gives every rounded pose exactly.
 
-    Examples:
-        >>> import torch
-        >>> pack_tracks(torch.tensor([[[1.0, 2.0, 0.5], [1.5, 2.0, 0.5], [torch.nan] * 3, [2.0, 2.0, 0.5]]]))
-        [[100, 200, 50, 50, 0, 0, None, 50, 0, 0]]
-    """
-    tracks = []
-    for agent in poses.numpy():
-        there = np.isfinite(agent).all(-1)
-        steps = np.diff(_whole(agent[there]), axis=0, prepend=np.zeros((1, 3), dtype=np.int64))
-        if there.all():
-            tracks.append(steps.ravel().tolist())
-            continue
-        rest = iter(steps.tolist())
-        tracks.append([item for known in there for item in (next(rest) if known else [None])])
-    return tracks
+def _pack_mishaps(collides: Tensor, offroad: Tensor) -> dict[str, dict[str, list[int]]]:
+    """Of each agent to which it happens: first step and length of each run."""
+    return {
+        name: {str(agent): run_lengths(flags[agent].numpy()) for agent in flags.any(-1).nonzero()[:, 0].tolist()}
+        for name, flags in (("collides", collides), ("offroad", offroad))
+    }
+
+
+def _pack_coupling(couplings: Couplings, row: int, agent: int) -> str:
+    """Of each step: 0 where nothing is coupled, else the partner's number from 1 on and the cost in hundredths."""
+    numbers: list[int] = []
+    for partner, cost in zip(couplings.partner[row, agent].tolist(), couplings.cost[row, agent].tolist(), strict=True):
+        numbers += [0] if math.isnan(cost) else [partner + 1, round(100 * cost)]
+    return pack_numbers(numbers)
 
 
 def _pack_map(scene: Scene) -> list[dict[str, Any]]:
     packed = []
     for layer in style.MAP_LAYERS:
-        lines = [_pack_line(line[:, :2].numpy()) for line in polylines(scene, layer.kinds)]
+        lines = [line[:, :2].numpy() for line in polylines(scene, layer.kinds)]
         if lines:
-            packed.append({"paint": layer.paint, "color": layer.color, "width": layer.width, "lines": lines})
+            texts = [pack_line(line[simplified(line, MAP_TOLERANCE)]) for line in lines]
+            packed.append({"paint": layer.paint, "color": layer.color, "width": layer.width, "lines": texts})
     return packed
-
-
-def _pack_line(line: NDArray[np.float32]) -> list[int]:
-    points = _whole(line[simplified(line, MAP_TOLERANCE)])
-    return np.diff(points, axis=0, prepend=np.zeros((1, 2), dtype=np.int64)).ravel().tolist()
-
-
-def simplified(line: NDArray[np.float32], tolerance: float) -> NDArray[np.bool_]:
-    """Which points of a polyline to keep so that it moves by no more than a tolerance (Ramer, Douglas and Peucker).
-
-    Args:
-        line: ``[n, 2]``.
-        tolerance: [m].
-
-    Returns:
-        ``[n]`` bool; the ends are kept.
-
-    Examples:
-        >>> simplified(np.array([[0.0, 0.0], [1.0, 0.01], [2.0, 0.0], [2.0, 5.0]]), 0.1).tolist()
-        [True, False, True, True]
-    """
-    keep = np.zeros(len(line), dtype=bool)
-    keep[[0, -1]] = True
-    pieces = [(0, len(line) - 1)]
-    while pieces:
-        first, last = pieces.pop()
-        if last - first < 2:
-            continue
-        chord, inner = line[last] - line[first], line[first + 1 : last] - line[first]
-        # The distance is to the chord, not to its line: a track that doubles back would else lose its turning point.
-        along = np.clip(inner @ chord / max(float(chord @ chord), 1e-12), 0, 1)
-        away = np.linalg.norm(inner - along[:, None] * chord, axis=1)
-        worst = int(away.argmax())
-        if away[worst] > tolerance:
-            middle = first + 1 + worst
-            keep[middle] = True
-            pieces += [(first, middle), (middle, last)]
-    return keep
 
 
 def _pack_lights(scene: Scene) -> list[dict[str, Any]]:
@@ -181,9 +164,5 @@ def _pack_lights(scene: Scene) -> list[dict[str, Any]]:
         groups = [style.LIGHT_GROUP.get(state) for state in states]
         seen = [step for step, group in enumerate(groups) if group is not None]
         if seen:
-            packed.append({"at": _whole(points[seen[0], :2].numpy()).tolist(), "groups": groups})
+            packed.append({"at": whole(points[seen[0], :2].numpy()).tolist(), "groups": groups})
     return packed
-
-
-def _whole(values: NDArray[np.floating]) -> NDArray[np.int64]:
-    return np.rint(np.asarray(values, dtype=np.float64) / CENTIMETRE).astype(np.int64)

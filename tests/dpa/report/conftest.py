@@ -1,11 +1,35 @@
-"""A small comparison with everything that a real one has."""
+"""A small comparison with everything that a real one has, and a browser to open pages in."""
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from matplotlib.figure import Figure
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+"""Names of an installed browser; where there is none, Playwright's own is used."""
+QUIET = (
+    "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update", "--disable-sync",
+    "--no-first-run", "--disable-quic",
+)  # fmt: skip
+"""A browser that asks nothing of a network by itself."""
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[Any]:
+    """A headless Chromium (a Playwright ``Browser``); tests that open pages are skipped where there is none."""
+    api = pytest.importorskip("playwright.sync_api", reason="needs Playwright: pip install -e .[dev]")
+    installed = next(filter(None, map(shutil.which, BROWSERS)), None)
+    with api.sync_playwright() as playwright:
+        try:
+            browser = playwright.chromium.launch(executable_path=installed, args=list(QUIET))
+        except api.Error as error:
+            pytest.skip(f"needs a browser: install chromium, or playwright install chromium ({error.message[:200]})")
+        yield browser
+        browser.close()
 
 
 @pytest.fixture
