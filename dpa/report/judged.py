@@ -31,10 +31,16 @@ class Couplings(NamedTuple):
     """Steps of 0.1 s from one to the next; the first is ``stride`` steps after the current one."""
     features: tuple[str, ...]
     """Names of the D features."""
+    weights: Tensor
+    """``[D]``: of the cost of a pair of steps."""
+    valid: Tensor
+    """``[E, T']`` bool."""
+    rollouts: Tensor
+    """``[R, E, T', D]``: features, clipped; 0 where not valid."""
+    log: Tensor
+    """``[E, T', D]``: likewise."""
     partner: Tensor
-    """``[R, E, T']`` int64: the step of the log that most of the mass of a step goes to; -1 where nothing is."""
-    cost: Tensor
-    """``[R, E, T']``: of that pair; NaN where there is none."""
+    """``[R, E, T']`` int64: the step of the log that most of the mass of a step goes to; -1 where not valid."""
     share: Tensor
     """``[R, E, D]``: share of each feature in what the agent pays; rows sum to 1, or are 0 where it pays nothing."""
 
@@ -210,8 +216,8 @@ def couple(distance: PreferenceDistance, scene: Scene, trajectories: Tensor, age
         >>> from envs.sources.synthetic import straight_road
         >>> scene = straight_road(2)
         >>> coupled = couple(PreferenceDistance(), scene, log_trajectory(scene, 80)[None], torch.arange(2))
-        >>> coupled.cost.shape, float(coupled.cost.sum())
-        (torch.Size([1, 2, 16]), 0.0)
+        >>> coupled.partner[0, 0].tolist() == list(range(16)), float(coupled.share.sum())
+        (True, 0.0)
     """
     names, stride = feature_names(distance.features), max(distance.stride, COUPLING_STRIDE)
     weights = feature_weights(names, distance.weights)
@@ -221,15 +227,15 @@ def couple(distance: PreferenceDistance, scene: Scene, trajectories: Tensor, age
     step = stride * STEP_SECONDS
     sides = (rollouts, log, valid, valid, weights)
     moved = transport_cost(*sides, method=distance.method, coupling=True, step=step, **distance.solver)
-    partner = moved.coupling.argmax(-1)
-    values = log.expand_as(rollouts).gather(2, partner[..., None].expand_as(rollouts))
-    cost = (weights.double() * (rollouts.double() - values.double()) ** 2).sum(-1).sqrt()
     paid = moved.distance[..., None]
     return Couplings(
         agents=agents,
         stride=stride,
         features=names,
-        partner=torch.where(valid, partner, -1),
-        cost=torch.where(valid, cost, torch.nan),
+        weights=weights,
+        valid=valid,
+        rollouts=rollouts,
+        log=log,
+        partner=torch.where(valid, moved.coupling.argmax(-1), -1),
         share=torch.where(paid > 0, moved.parts / paid, 0),
     )

@@ -85,10 +85,21 @@
         collides: unpackFlags(scene.log.collides, 0, data.steps, same),
         offroad: unpackFlags(scene.log.offroad, 0, data.steps, same),
       };
+      log.left = log.offroad.map(leftSince(log));
       unpacked.set(index, { ...scene, layers: scene.map.map(unpackLayer), log, fit: scene.view.map((value) => value * UNIT),
                             memo: new Map(), dearest: new Map() });
     }
     return unpacked.get(index);
+  }
+
+  // Many agents stand in a drive or walk beside the road all the time; what tells is who was on it and left it.
+  function leftSince(log) {
+    const outside = new Set();
+    log.tracks.forEach((track, agent) => {
+      const start = track[data.now] ? data.now : track.findIndex(Boolean);
+      if (start >= 0 && log.offroad[start].has(agent)) outside.add(agent);
+    });
+    return (set) => new Set([...set].filter((agent) => !outside.has(agent)));
   }
 
   const methodsOf = (scene) => Object.keys(scene.rollouts);
@@ -107,7 +118,8 @@
         const sets = unpackFlags(kept[name], first, data.steps, (row) => scene.present[row]);
         return scene.log[name].map((set, step) => step < first ? set : sets[step]);
       };
-      scene.memo.set(key, { tracks, collides: flags("collides"), offroad: flags("offroad"), agents: unpackAgents(scene, given, kept) });
+      const offroad = flags("offroad"), left = offroad.map(leftSince(scene.log));
+      scene.memo.set(key, { tracks, collides: flags("collides"), offroad, left, agents: unpackAgents(scene, given, kept) });
     }
     return scene.memo.get(key);
   }
@@ -115,25 +127,36 @@
   // Ranked agents, the one that pays most first.
   function unpackAgents(scene, given, kept) {
     const count = given.features.length, shares = unpackNumbers(kept.share), all = kept.paid.reduce((a, b) => a + b, 0);
+    const root = given.features.map(({ weight }) => Math.sqrt(weight));
     const agents = given.ranked.map((row, i) => ({
       agent: scene.present[row],
       paid: kept.paid[i],
       part: all > 0 ? kept.paid[i] / all : 0,
-      shares: given.features.map((name, k) => [name, shares[i * count + k] || 0]),
-      pairs: unpackPairs(kept.coupling[i], given.stride),
+      shares: given.features.map(({ name }, k) => [name, shares[i * count + k] || 0]),
+      ...unpackCoupling(given, kept, i, root),
     }));
     return agents.sort((a, b) => b.paid - a.paid);
   }
 
-  // Times [s] after now of a step of the rollout and of its partner in the log, and what the pair costs.
-  function unpackPairs(text, stride) {
-    const numbers = unpackNumbers(text), pairs = [], step = stride * data.seconds;
-    for (let i = 0, row = 1; i < numbers.length; row++) {
-      if (!numbers[i]) { i += 1; continue; }
-      pairs.push({ rollout: row * step, log: numbers[i] * step, cost: (numbers[i + 1] || 0) * UNIT });
-      i += 2;
+  // Features at the valid steps of an agent, and of each pair of steps what it costs.
+  function unpackCoupling(given, kept, i, root) {
+    const step = given.stride * data.seconds, times = [];
+    for (let k = 0; k < given.valid[i].length; k += 2) {
+      for (let n = 0; n < given.valid[i][k + 1]; n++) times.push((given.valid[i][k] + n + 1) * step);
     }
-    return pairs;
+    const rollout = unpackFeatures(kept.features[i], times.length, root.length), log = unpackFeatures(given.log[i], times.length, root.length);
+    const between = (a, b) => Math.hypot(...root.map((weight, k) => weight * (a[k] - b[k])));
+    const partner = unpackNumbers(kept.coupling[i]);
+    const pairs = times.map((time, row) => {
+      const column = times.findIndex((other) => Math.abs(other - step * (1 + (partner[row] || 0))) < step / 2);
+      return { rollout: time, log: times[column], cost: between(rollout[row], log[column]), values: [rollout[row], log[column]] };
+    });
+    return { step, times, pairs, costs: () => rollout.map((mine) => log.map((theirs) => between(mine, theirs))) };
+  }
+
+  function unpackFeatures(text, steps, count) {
+    const numbers = unpackNumbers(text), values = Array(count).fill(0);
+    return Array.from({ length: steps }, (_, step) => values.map((_, k) => (values[k] += numbers[step * count + k] || 0) * UNIT));
   }
 
   // --- geometry ------------------------------------------------------------------------------------------------
@@ -217,7 +240,7 @@
     }
   }
 
-  function drawAgents(ctx, scene, poses, offroad, scale) {
+  function drawAgents(ctx, scene, poses, offroad, left, scale) {
     poses.forEach((pose, agent) => {
       if (!pose) return;
       const { color, halo } = data.classes[scene.class[agent]], box = corners(pose, scene.size[agent]);
@@ -225,9 +248,9 @@
       if (halo) { ctx.globalAlpha = 0.25; disc(ctx, pose[0], pose[1], 6 / scale); ctx.globalAlpha = 1; }
       outline(ctx, box);
       ctx.fill();
-      if (offroad.has(agent)) hatch(ctx, box, pose, scene.size[agent], scale);
+      if (left.has(agent)) hatch(ctx, box, pose, scene.size[agent], scale);
       outline(ctx, box);
-      ctx.lineWidth = (offroad.has(agent) ? 2 : 0.7) / scale;
+      ctx.lineWidth = (left.has(agent) ? 2.5 : offroad.has(agent) ? 1.2 : 0.7) / scale;
       ctx.strokeStyle = offroad.has(agent) ? ROAD : "#ffffff";
       ctx.stroke();
       const mix = (a, b, t) => [a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1])];
@@ -302,7 +325,8 @@
     drawMap(ctx, scene, scale);
     if ($("paths").checked) drawPaths(ctx, scene, side.tracks, state.time, scale);
     if (ghosts) drawOutlines(ctx, scene, ghosts.map((track) => poseAt(track, state.time)), scale, []);
-    drawAgents(ctx, scene, poses, marks ? side.offroad[step] : new Set(), scale);
+    const none = new Set();
+    drawAgents(ctx, scene, poses, marks ? side.offroad[step] : none, marks ? side.left[step] : none, scale);
     drawLights(ctx, scene, state.time, scale);
     if (coupled) drawOutlines(ctx, scene, coupled, scale, [4, 3]);
     const ring = (agent, look) => { if (poses[agent]) drawRing(ctx, poses[agent], scene.size[agent], scale, look); };
@@ -320,7 +344,7 @@
   function drawStrip(rollout) {
     const { ctx, width, height } = sharp($("strip")), room = Math.max(width - 2 * THUMB, 1), each = room / (data.steps - 1);
     ctx.clearRect(0, 0, width, height);
-    const rows = [["collides", RING], ["offroad", ROAD]], tall = height / 2 - 2;
+    const rows = [["collides", RING], ["left", ROAD]], tall = height / 2 - 2;
     rows.forEach(([name, color], row) => {
       const top = row * (height / 2) + 1, most = Math.max(1, ...rollout[name].map((set) => set.size));
       ctx.fillStyle = "rgba(120, 126, 133, 0.13)";
@@ -374,23 +398,36 @@
     return `rgb(${COSTS[low].map((value, k) => Math.round(value + (place - low) * (COSTS[low + 1][k] - value))).join(" ")})`;
   }
 
+  // Every pair of steps that could be coupled: the darker the dearer. Steps that the log lacks are left sand-coloured.
+  function drawCosts(ctx, entry, x, y, most) {
+    const half = entry.step / 2, size = x(entry.step) - x(0), last = LAST + half;
+    ctx.fillStyle = "#f4ead8";
+    ctx.fillRect(x(half), y(last), x(last) - x(half), y(half) - y(last));
+    entry.costs().forEach((row, i) => row.forEach((cost, k) => {
+      const grey = Math.round(252 - 80 * Math.min(cost / most, 1));
+      ctx.fillStyle = `rgb(${grey} ${grey} ${grey + 4})`;
+      ctx.fillRect(x(entry.times[k] - half), y(entry.times[i] + half), size + 0.5, size + 0.5);
+    }));
+  }
+
   const tone = (name, fallback) => getComputedStyle($("matrix")).getPropertyValue(name).trim() || fallback;
 
-  function matrixFrame(width) {
-    const left = 42, top = 30, side = width - left - 12, seconds = (data.steps - 1 - data.now) * data.seconds;
-    return { left, top, side: Math.max(side - 28, 10), seconds };
-  }
+  const LAST = (data.steps - 1 - data.now) * data.seconds;
+
+  // Where the matrix lies on its canvas, and how much time each of its sides spans; a cell lies around its step.
+  const matrixFrame = (width, step) => ({ left: 42, top: 30, side: Math.max(width - 82, 10), seconds: LAST + step / 2 });
 
   function drawMatrix(scene, entry) {
     const { ctx, width, height } = sharp($("matrix"));
     ctx.clearRect(0, 0, width, height);
     if (!entry || !width) return;
-    const { left, top, side, seconds } = matrixFrame(width), most = dearestPair(scene, entry.agent);
+    const { left, top, side, seconds } = matrixFrame(width, entry.step), most = dearestPair(scene, entry.agent);
     const x = (time) => left + time / seconds * side, y = (time) => top + side - time / seconds * side;
     const ink = tone("--ink", INK), quiet = tone("--quiet", "#5f6368"), rule = tone("--rule", "#e3e5e8");
     ctx.font = "12px system-ui, sans-serif";
     ctx.lineWidth = 1;
-    for (let time = 0; time <= seconds + 1e-6; time += 2) {
+    drawCosts(ctx, entry, x, y, most);
+    for (let time = 0; time <= LAST + 1e-6; time += 2) {
       ctx.strokeStyle = rule;
       ctx.beginPath(); ctx.moveTo(x(time), y(0)); ctx.lineTo(x(time), y(seconds)); ctx.moveTo(x(0), y(time)); ctx.lineTo(x(seconds), y(time)); ctx.stroke();
       ctx.fillStyle = quiet;
@@ -419,11 +456,13 @@
       ctx.beginPath(); ctx.moveTo(x(current.log), y(current.rollout)); ctx.lineTo(x(current.log), y(0)); ctx.stroke();
       ctx.setLineDash([]);
     }
-    const radius = Math.max(3, side / (seconds / (entry.pairs.length > 1 ? entry.pairs[1].rollout - entry.pairs[0].rollout : 1)) * 0.34);
+    const radius = Math.min(Math.max(side / seconds * entry.step * 0.32, 3), 9);
     for (const pair of entry.pairs) {
       ctx.fillStyle = costColor(pair.cost / most);
-      disc(ctx, x(pair.log), y(pair.rollout), Math.min(radius, 9));
-      if (pair === current) { ctx.strokeStyle = ink; ctx.lineWidth = 2; ctx.stroke(); ctx.lineWidth = 1; }
+      disc(ctx, x(pair.log), y(pair.rollout), radius);
+      ctx.strokeStyle = pair === current ? ink : "#ffffff";
+      ctx.lineWidth = pair === current ? 2.5 : 1;
+      ctx.stroke();
     }
     const wide = 110, right = left + side, ramp = ctx.createLinearGradient(right - wide, 0, right, 0);
     for (const part of [0, 0.25, 0.5, 0.75, 1]) ramp.addColorStop(part, costColor(part));
@@ -441,7 +480,7 @@
   const signed = (seconds) => (seconds < -0.05 ? "−" : "+") + Math.abs(seconds).toFixed(1) + " s";
 
   function sentenceOf(scene, entry) {
-    const name = scene.agents[entry.agent], pairs = entry.pairs, steps = plural(pairs.length, "step");
+    const name = scene.agents[entry.agent].replace(/^./, (letter) => letter.toUpperCase()), pairs = entry.pairs, steps = plural(pairs.length, "step");
     if (!entry.paid) return `${name} pays nothing: this rollout drives it as the log does.`;
     const [feature, share] = entry.shares.reduce((a, b) => b[1] > a[1] ? b : a);
     const pays = `${name} pays ${percent(entry.part)} of this rollout's distance (${entry.paid.toFixed(1)}), most of it for ${feature} (${share} %).`;
@@ -457,7 +496,11 @@
   function momentOf(entry) {
     const pair = pairNow(entry);
     if (!pair) return state.time <= data.now + 1e-6 ? "Until 0 s the rollout is the log." : "At this moment the log has no valid step, so nothing is coupled.";
-    return `At ${signed(pair.rollout)} the rollout is coupled with ${signed(pair.log)} of the log, at a cost of ${pair.cost.toFixed(1)}.`;
+    const { features } = sceneAt(state.scene).rollouts[state.method];
+    const apart = features.map(({ weight }, k) => weight * (pair.values[0][k] - pair.values[1][k]) ** 2), most = apart.indexOf(Math.max(...apart));
+    const [mine, theirs] = pair.values.map((values) => values[most].toFixed(1).replace("-", "−")), unit = features[most].unit === "1" ? "" : " " + features[most].unit;
+    const why = pair.cost < 0.05 ? "" : ` The most of it is ${features[most].name}: ${mine}${unit} in the rollout, ${theirs}${unit} in the log.`;
+    return `At ${signed(pair.rollout)} the rollout is coupled with ${signed(pair.log)} of the log, at a cost of ${pair.cost.toFixed(1)}.${why}`;
   }
 
   function showParts(entry) {
@@ -479,7 +522,9 @@
   function note(element, name, side, rest) {
     const step = Math.floor(state.time), bold = document.createElement("b");
     bold.textContent = name;
-    element.replaceChildren(bold, `${rest} · ${side.collides[step].size} collide, ${side.offroad[step].size} off the road`);
+    const left = side.left[step].size, outside = side.offroad[step].size - left;
+    const beside = outside ? `, ${outside} ${outside === 1 ? "is" : "are"} off it from the start` : "";
+    element.replaceChildren(bold, `${rest} · ${side.collides[step].size} in collision, ${left} left the road${beside}`);
   }
 
   function draw() {
@@ -522,7 +567,7 @@
   }
 
   const ending = (number) => ["th", "st", "nd", "rd"][number % 100 > 10 && number % 100 < 14 ? 0 : number % 10] || "th";
-  const nats = (value) => value.toFixed(2).replace("-", "−") + " nats";
+  const nats = (value) => value.toPrecision(3).replace("-", "−") + " nats";
 
   function describe(given, index) {
     const kept = given.kept[index], place = 1 + kept[$("sort").value];
@@ -656,7 +701,7 @@
     if (data.scenes.some((scene) => scene.lights.length)) {
       for (const [name, color] of Object.entries(data.lights)) entries.push(["light: " + name, color, ""]);
     }
-    entries.push(["collides", "", "ring"], ["off the road", "", "road"], ["chosen agent, and in the log where it is coupled", "", "chosen"]);
+    entries.push(["in collision", "", "ring"], ["left the road", "", "road"], ["off it from the start", "", "beside"], ["chosen agent, and in the log where it is coupled", "", "chosen"]);
     for (const [name, color, look] of entries) {
       const item = document.createElement("span"), swatch = document.createElement("i");
       if (look) swatch.className = look; else swatch.style.background = color;
@@ -674,7 +719,9 @@
   $("time").addEventListener("input", (event) => seek(Number(event.target.value)));
   $("strip").addEventListener("click", (event) => seek((event.offsetX - THUMB) / (event.target.clientWidth - 2 * THUMB) * (data.steps - 1)));
   $("matrix").addEventListener("click", (event) => {
-    const { top, side, seconds } = matrixFrame(event.target.clientWidth), time = (top + side - event.offsetY) / side * seconds;
+    const entry = chosenAgent();
+    if (!entry) return;
+    const { top, side, seconds } = matrixFrame(event.target.clientWidth, entry.step), time = (top + side - event.offsetY) / side * seconds;
     if (time >= 0 && time <= seconds) seek(data.now + Math.round(time / data.seconds));
   });
   $("play").addEventListener("click", play);

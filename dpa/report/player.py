@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import torch
+import numpy as np
 from torch import Tensor
 
+from dpa.ranking import FEATURES
 from dpa.report.judged import Couplings, JudgedRollouts, logged_mishaps
 from dpa.report.packing import pack_line, pack_numbers, pack_tracks, run_lengths, simplified, whole
 from envs.render import fit_view, pose_tracks, style
@@ -81,7 +81,7 @@ def _pack_scene(player: PlayerScene) -> dict[str, Any]:
     collides, offroad = logged_mishaps(scene)
     return {
         "id": scene.scene_id,
-        "view": whole(torch.tensor(fit_view(scene)).numpy()).tolist(),
+        "view": whole(np.array(fit_view(scene))).tolist(),
         "map": _pack_map(scene),
         "lights": _pack_lights(scene),
         "class": [
@@ -108,15 +108,14 @@ def _pack_method(scene: Scene, method: str, judged: JudgedRollouts) -> dict[str,
         )
     return {
         "sampled": judged.sampled,
-        "features": [name.replace("_", " ") for name in judged.couplings.features],
-        "stride": judged.couplings.stride,
-        "ranked": judged.couplings.agents.tolist(),
+        **_pack_measure(judged.couplings),
         "kept": [_pack_rollout(judged, row) for row in range(len(judged.poses))],
     }
 
 
 def _pack_rollout(judged: JudgedRollouts, row: int) -> dict[str, Any]:
     couplings = judged.couplings
+    pairs = zip(couplings.partner[row], couplings.valid, strict=True)
     return {
         "number": int(judged.number[row]),
         "distance": round(float(judged.distance[row]), 3),
@@ -127,8 +126,29 @@ def _pack_rollout(judged: JudgedRollouts, row: int) -> dict[str, Any]:
         **_pack_mishaps(judged.collides[row], judged.offroad[row]),
         "paid": [round(paid, 3) for paid in judged.agent_distance[row][couplings.agents].tolist()],
         "share": pack_numbers((100 * couplings.share[row]).round().long().flatten().tolist()),
-        "coupling": [_pack_coupling(couplings, row, agent) for agent in range(len(couplings.agents))],
+        "features": _pack_features(couplings.rollouts[row], couplings.valid),
+        "coupling": [pack_numbers(partners[valid].tolist()) for partners, valid in pairs],
     }
+
+
+def _pack_measure(couplings: Couplings) -> dict[str, Any]:
+    """What all rollouts of a method share: whom and when they are measured, by what, and their log."""
+    return {
+        "features": [
+            {"name": name.replace("_", " "), "unit": FEATURES[name].unit.replace("^2", "²"), "weight": weight}
+            for name, weight in zip(couplings.features, couplings.weights.tolist(), strict=True)
+        ],
+        "stride": couplings.stride,
+        "ranked": couplings.agents.tolist(),
+        "valid": [run_lengths(valid.numpy()) for valid in couplings.valid],
+        "log": _pack_features(couplings.log, couplings.valid),
+    }
+
+
+def _pack_features(features: Tensor, valid: Tensor) -> list[str]:
+    """Of each agent its features ``[E, T', D]`` at the valid steps in hundredths, each against the step before."""
+    rows = (whole(values[there].numpy()) for values, there in zip(features, valid, strict=True))
+    return [pack_numbers(np.diff(values, axis=0, prepend=0 * values[:1]).ravel().tolist()) for values in rows]
 
 
 def _pack_mishaps(collides: Tensor, offroad: Tensor) -> dict[str, dict[str, list[int]]]:
@@ -137,14 +157,6 @@ def _pack_mishaps(collides: Tensor, offroad: Tensor) -> dict[str, dict[str, list
         name: {str(agent): run_lengths(flags[agent].numpy()) for agent in flags.any(-1).nonzero()[:, 0].tolist()}
         for name, flags in (("collides", collides), ("offroad", offroad))
     }
-
-
-def _pack_coupling(couplings: Couplings, row: int, agent: int) -> str:
-    """Of each step: 0 where nothing is coupled, else the partner's number from 1 on and the cost in hundredths."""
-    numbers: list[int] = []
-    for partner, cost in zip(couplings.partner[row, agent].tolist(), couplings.cost[row, agent].tolist(), strict=True):
-        numbers += [0] if math.isnan(cost) else [partner + 1, round(100 * cost)]
-    return pack_numbers(numbers)
 
 
 def _pack_map(scene: Scene) -> list[dict[str, Any]]:
