@@ -1,4 +1,4 @@
-"""The page is one valid, self-contained file; what the player unpacks is what was packed."""
+"""The page is one valid, self-contained file."""
 
 from __future__ import annotations
 
@@ -9,19 +9,13 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from PIL import Image
-from torch import Tensor
 
 from dpa.report.page import Picture, write_page
-from dpa.report.player import PlayerScene, pack_players, pack_tracks, simplified
-from envs.render import pose_tracks
-from envs.scene import AgentKind, Scene
-from envs.sources.synthetic import red_light, straight_road, two_cars_head_on
+from dpa.report.player import PlayerScene
+from envs.sources.synthetic import straight_road
+from tests.dpa.report.made_rollouts import judged, slower
 
 VOID = {"meta", "br", "img", "input", "hr", "link"}
 
@@ -54,23 +48,12 @@ class Page(HTMLParser):
             self.text.append(data)
 
 
-def unpack(track: list[int | None]) -> list[tuple[int, int, int] | None]:
-    """What the player's script does, in whole centimetres."""
-    poses, pose, rest = [], np.zeros(3, dtype=int), iter(track)
-    for item in rest:
-        if item is None:
-            poses.append(None)
-            continue
-        pose = pose + np.array((item, next(rest), next(rest)))
-        poses.append(tuple(pose.tolist()))
-    return poses
-
-
 @pytest.fixture
 def players() -> list[PlayerScene]:
-    rollouts = {"reference": torch.rand(2, 2, 80, 3) * 50, "DPA </script><b>": torch.zeros(1, 2, 80, 3)}
-    evil = two_cars_head_on()
+    evil = straight_road(2)
     evil.scene_id = "<img src=x> </script> & <!--{config}-->"
+    two, one = judged(evil, [slower(evil, 9), slower(evil, 5)], [-2.0, -1.0]), judged(evil, [slower(evil, 7)], [-1.5])
+    rollouts = {"reference": two, "DPA </script><b>": one}
     return [PlayerScene(straight_road(2), rollouts), PlayerScene(evil, rollouts)]
 
 
@@ -119,7 +102,7 @@ def test_the_page_shows_table_command_versions_and_times(page: str) -> None:
 def test_the_player_data_hold_scenes_and_every_method(page: str) -> None:
     data = json.loads(Page(page).data)
     assert [scene["id"] for scene in data["scenes"]][1].startswith("<img src=x> </script>")
-    assert [len(rollouts) for rollouts in data["scenes"][0]["rollouts"].values()] == [2, 1]
+    assert [len(given["kept"]) for given in data["scenes"][0]["rollouts"].values()] == [2, 1]
 
 
 def test_the_page_is_replaced_whole_and_kept_on_failure(page: str, comparison: dict[str, Any], tmp_path: Path) -> None:
@@ -144,58 +127,6 @@ def test_a_missing_key_and_a_figure_that_is_no_png_are_named(comparison: dict[st
     (tmp_path / "x.png").write_text("text")
     with pytest.raises(ValueError, match=r"x\.png is not a PNG"):
         write_page(tmp_path, comparison, [Picture(tmp_path / "x.png", "x")], config={})
-
-
-@pytest.mark.parametrize("shape", [(2, 80, 3), (1, 3, 80, 3), (1, 2, 79, 3), (0, 2, 80, 3)])
-def test_rollouts_that_do_not_fit_are_refused_with_scene_and_method(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=r"straight_road_2_None, method 'm': .*A'=2"):
-        pack_players([PlayerScene(straight_road(2), {"m": torch.zeros(shape)})])
-
-
-@settings(max_examples=25, deadline=None)
-@given(st.lists(st.one_of(st.none(), st.tuples(*[st.floats(-900, 900)] * 3)), min_size=1, max_size=12))
-def test_packed_tracks_unpack_to_the_rounded_poses(poses: list[tuple[float, float, float] | None]) -> None:
-    rows = torch.tensor([[pose or (math.nan,) * 3 for pose in poses]], dtype=torch.float64)
-    (packed,) = pack_tracks(rows)
-    expected = [None if pose is None else tuple(round(value * 100) for value in pose) for pose in poses]
-    for found, want in zip(unpack(packed), expected, strict=True):
-        assert (found is None) == (want is None)
-        assert found is None or np.abs(np.subtract(found, want)).max() <= 1
-
-
-def test_the_packed_log_is_the_log_and_absent_agents_stay_absent() -> None:
-    scene = straight_road(2)
-    scene.agents.valid[1, 20:] = False
-    scene.agents.kind[1] = AgentKind.PEDESTRIAN
-    data = pack_players([PlayerScene(scene, {})])
-    packed = data["scenes"][0]
-    assert [data["classes"][index]["name"] for index in packed["class"]] == ["SDC", "Pedestrian"]
-    tracks = [unpack(track) for track in packed["log"]]
-    assert tracks[1][20:] == [None] * 71
-    log: Tensor = pose_tracks(scene)
-    np.testing.assert_allclose(np.array(tracks[0]) / 100, log[0].numpy(), atol=0.0051)
-
-
-def test_lights_are_packed_step_by_step() -> None:
-    scene: Scene = red_light()
-    scene.lights.state[0, 5] = -1
-    (light,) = pack_players([PlayerScene(scene, {})])["scenes"][0]["lights"]
-    assert light["at"] == [2000, -250]
-    assert [step for step, group in enumerate(light["groups"]) if group != "stop"] == [5]
-
-
-@settings(max_examples=25, deadline=None)
-@given(st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=1, max_size=15))
-def test_a_simplified_line_keeps_its_ends_and_stays_near_its_points(points: list[tuple[float, float]]) -> None:
-    line = np.array(points)
-    keep = simplified(line, 0.5)
-    assert keep[0] and keep[-1]
-    kept = keep.nonzero()[0]
-    for index in (~keep).nonzero()[0]:
-        start, end = line[kept[kept < index][-1]], line[kept[kept > index][0]]
-        chord = end - start
-        along = np.clip((line[index] - start) @ chord / max(chord @ chord, 1e-12), 0, 1)
-        assert np.linalg.norm(line[index] - start - along * chord) <= 0.5 + 1e-9
 
 
 if __name__ == "__main__":
