@@ -90,7 +90,9 @@ def _pack_scene(player: PlayerScene) -> dict[str, Any]:
         ],
         "agents": [
             f"{'SDC' if sdc else AgentKind(kind).name.lower()} {track}"
-            for kind, sdc, track in zip(agents.kind.tolist(), agents.sdc.tolist(), agents.track_id.tolist(), strict=True)
+            for kind, sdc, track in zip(
+                agents.kind.tolist(), agents.sdc.tolist(), agents.track_id.tolist(), strict=True
+            )
         ],
         "size": whole(agents.extent[:, :2].numpy()).tolist(),
         "log": {"tracks": pack_tracks(pose_tracks(scene)), **_pack_mishaps(collides, offroad)},

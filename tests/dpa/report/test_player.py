@@ -17,11 +17,11 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from dpa.ranking import PreferenceDistance, log_trajectory
+from dpa.realism import realism
 from dpa.report.coupling import couple_agent
 from dpa.report.judged import couple, kept_rollouts, logged_mishaps, mishaps
 from dpa.report.packing import pack_numbers, pack_tracks, run_lengths, simplified
 from dpa.report.player import PlayerScene, pack_players
-from dpa.realism import realism
 from envs.render import pose_tracks
 from envs.scene import AgentKind, MapKind, Scene
 from envs.sources.synthetic import build_scene, red_light, straight_road, two_cars_head_on
@@ -249,7 +249,9 @@ def test_couplings_are_those_of_the_ranking(method: str, solver: dict[str, float
 def test_a_distance_at_ten_hertz_is_shown_at_two() -> None:
     scene = straight_road(2)
     trajectories = slower(scene, 20.0)[None]
-    fine, coarse = (couple(PreferenceDistance(stride=stride), scene, trajectories, torch.arange(2)) for stride in (1, 5))
+    fine, coarse = (
+        couple(PreferenceDistance(stride=stride), scene, trajectories, torch.arange(2)) for stride in (1, 5)
+    )
     assert fine.stride == coarse.stride == 5 and torch.equal(fine.partner, coarse.partner)
     assert couple(PreferenceDistance(stride=10), scene, trajectories, torch.arange(2)).partner.shape[-1] == 8
 
