@@ -249,11 +249,11 @@ def test_couplings_are_those_of_the_ranking(method: str, solver: dict[str, float
 def test_a_distance_at_ten_hertz_is_shown_at_two() -> None:
     scene = straight_road(2)
     trajectories = slower(scene, 20.0)[None]
-    fine, coarse = (
-        couple(PreferenceDistance(stride=stride), scene, trajectories, torch.arange(2)) for stride in (1, 5)
+    fine, coarse, coarsest = (
+        couple(PreferenceDistance(stride=stride), scene, trajectories, torch.arange(2)) for stride in (1, 5, 10)
     )
     assert fine.stride == coarse.stride == 5 and torch.equal(fine.partner, coarse.partner)
-    assert couple(PreferenceDistance(stride=10), scene, trajectories, torch.arange(2)).partner.shape[-1] == 8
+    assert coarsest.stride == 10 and coarsest.partner.shape[-1] == 8
 
 
 def test_the_packed_pairs_are_an_optimal_assignment_and_their_cost_is_the_distance(packed: dict[str, Any]) -> None:

@@ -20,7 +20,8 @@ COUNT = """([name, color]) => {
   const {data} = copy.getImageData(0, 0, canvas.width, canvas.height);
   let count = 0;
   for (let i = 0; i < data.length; i += 4) {
-    if (Math.abs(data[i] - color[0]) + Math.abs(data[i + 1] - color[1]) + Math.abs(data[i + 2] - color[2]) < 24) count++;
+    const away = [0, 1, 2].map(k => Math.abs(data[i + k] - color[k]));
+    if (Math.max(...away) < 9) count++;
   }
   return count;
 }"""
