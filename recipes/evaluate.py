@@ -1,4 +1,4 @@
-"""Score a policy: WOSAC realism, minADE, collisions, off-road and the preference distance (METHOD section 7).
+"""Score a policy: WOSAC realism, minADE, collisions, off-road, the preference distance (METHOD section 7), and safety.
 
 python -m recipes.evaluate policy=runs/pretrain/policy.pt decoding.top_p=0.9 json=runs/reference.json
 """
@@ -20,6 +20,7 @@ from dpa.ranking import Distance
 from dpa.realism import RealismResult, mean_result, realism
 from dpa.realism.submission import SubmissionWriter, plan_submission
 from dpa.rollout import make_collector
+from dpa.safety import MEASURES, safety
 from envs.progress import progress
 from envs.scene import CURRENT_STEP
 from envs.store import SceneStore
@@ -42,6 +43,8 @@ SCENE_FIGURES = (
     "offroad_rate",
     "preference_distance",
     "standing_moved",
+    "spread",
+    *MEASURES,
 )
 """Figures of every scene, averaged over scenes."""
 
@@ -130,6 +133,8 @@ def score_scene(each: Rolled, distance: Distance, metric: str) -> dict[str, Any]
         "result": asdict(realism(each.scene, each.trajectories, metric)),
         "preference_distance": distance(each.scene, each.trajectories, each.controlled).distance.mean().item(),
         "standing_moved": standing_moved(each.scene, each.trajectories),
+        "spread": final_spread(each.scene, each.trajectories, each.controlled),
+        **safety(each.scene, each.trajectories, each.controlled),
     }
 
 
@@ -161,6 +166,22 @@ def standing_moved(scene: Any, trajectories: torch.Tensor) -> float:
         return float("nan")
     moved = (trajectories[:, standing, -1, :2] - xy[standing, 0]).norm(dim=-1) > MOVED
     return moved.float().mean().item()
+
+
+def final_spread(scene: Any, trajectories: torch.Tensor, controlled: torch.Tensor) -> float:
+    """How far apart rollouts end, small where sampling is sharp [m] (NaN: no evaluated agent is controlled).
+
+    The root mean square distance of an agent's last position from its mean over rollouts; the mean over evaluated
+    agents that the policy controls.
+
+    Args:
+        scene: uncollated.
+        trajectories: ``[K, A, T * F, 4]`` of the present agents.
+        controlled: ``[A]`` bool.
+    """
+    agents = scene.agents
+    last = trajectories[:, agents.evaluated[agents.present] & controlled, -1, :2]
+    return (last - last.mean(0)).square().sum(-1).mean(0).sqrt().mean().item()
 
 
 def _mean(values: list[float | None]) -> float | None:

@@ -1,4 +1,4 @@
-"""Jerks that no passenger would take for ordinary driving."""
+"""Jerks beyond what systems that drive are allowed."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from torch import Tensor
 from dpa.safety.motion import DECISION_SECONDS, DECISION_STEPS, Motion, lasts
 from envs.scene import STEP_SECONDS
 
-JERK_BOUND = 10.0
-"""Change of longitudinal or lateral acceleration that is harsh [m/s^3]."""
+JERK_BOUND = 5.0
+"""Jerk that is harsh [m/s^3]: the bound of UN Regulation No. 79 for the lateral jerk of a system that steers, as a
+mean over 0.5 s, and of ISO 15622 for the braking jerk of adaptive cruise control at low speed, as a mean over 1 s."""
 JERK_SECONDS = 0.3
 """For how long it has to be above the bound [s]."""
 
@@ -27,7 +28,7 @@ def harsh_jerk(motion: Motion) -> Tensor:
 
 
 def harsh(jerk: Tensor, there: Tensor, bound: float = JERK_BOUND) -> Tensor:
-    """``[K, E, T', 2]`` [m/s^3] and ``[E, T']`` bool -> ``[K, E]`` bool."""
+    """Whether some jerk stays above a bound: ``[K, E, T', 2]`` [m/s^3] and ``[E, T']`` bool -> ``[K, E]`` bool."""
     above = (jerk.abs() > bound) & there[..., None]
     return lasts(above.transpose(-1, -2), round(JERK_SECONDS / STEP_SECONDS) + 1).any(-1)
 
@@ -36,8 +37,8 @@ def jerks(poses: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
     """Longitudinal and lateral jerk in the vehicle's own frame, from differences over 0.5 s.
 
     Velocity is the displacement of 0.5 s, acceleration the difference of two of them in a row, split by the heading
-    between them; jerk is the difference of two such accelerations 0.5 s apart. Each is a mean over 0.5 s of what it stands
-    for, so that neither the noise of a track at 10 Hz nor the steps of tokens at 2 Hz is taken for a jerk.
+    between them; jerk is the difference of two such accelerations 0.5 s apart. So neither the noise of a track at
+    10 Hz nor the steps between tokens at 2 Hz are taken for jerks.
 
     Args:
         poses: ``[K, E, T, 4]`` x, y, z, heading.

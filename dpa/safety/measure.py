@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import torch
 from torch import Tensor
 
 from dpa.safety.close_pass import close_pass
@@ -20,7 +19,7 @@ MEASURES: dict[str, tuple[Callable[[Motion], Tensor | None], bool]] = {
     "close_pass": (close_pass, False),
     "harsh_jerk": (harsh_jerk, True),
 }
-"""Motion -> ``[K, A]`` bool by name, and whether it is a share of the controlled vehicles or of all controlled agents."""
+"""Motion -> ``[K, A]`` bool by name, and whether it is about controlled vehicles only or about all controlled agents."""
 
 
 def safety(scene: Scene, trajectories: Tensor, controlled: Tensor) -> dict[str, float | None]:
@@ -31,8 +30,8 @@ def safety(scene: Scene, trajectories: Tensor, controlled: Tensor) -> dict[str, 
 
     Args:
         scene: uncollated.
-        trajectories: ``[K, A, T, 4]`` x, y, z, heading at 10 Hz after the current step, of the present agents in the order
-            of the scene. They are measured at the steps at which the log is valid.
+        trajectories: ``[K, A, T, 4]`` x, y, z, heading at 10 Hz after the current step, of the present agents in the
+            order of the scene. They are measured at the steps at which the log is valid.
         controlled: ``[A]`` bool, agents that the policy moved.
 
     Returns:
@@ -43,6 +42,7 @@ def safety(scene: Scene, trajectories: Tensor, controlled: Tensor) -> dict[str, 
         ValueError: trajectories or controlled do not fit the scene.
 
     Examples:
+        >>> import torch
         >>> from envs.sources.synthetic import red_light
         >>> scene = red_light(speed=8.0)
         >>> log = torch.cat((scene.agents.position, scene.agents.heading[..., None]), -1)[None, :, 11:]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -65,5 +66,6 @@ def wrong_way(motion: Motion) -> Tensor | None:
     Returns:
         ``[K, A]`` bool; None for a scene without lanes.
     """
-    found = drives_against(motion)
-    return found if found is None else found & ~drives_against(motion.log)
+    together = replace(motion, poses=torch.cat((motion.poses, motion.log.poses)))
+    found = drives_against(together)
+    return None if found is None else found[:-1] & ~found[-1]

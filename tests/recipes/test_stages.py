@@ -35,7 +35,7 @@ from recipes import evaluate as evaluation
 from recipes.candidates import Group, make_candidates
 from recipes.cli import CONFIG, plain
 from recipes.draws import draw_rows, make_batch, parts_of
-from recipes.evaluate import SCENE_FIGURES, standing_moved
+from recipes.evaluate import SCENE_FIGURES, final_spread, standing_moved
 from recipes.losses import check_fit, make_loss
 from recipes.models import open_policy
 from recipes.partial import PartialResult
@@ -651,6 +651,19 @@ def test_standing_agents_that_rollouts_move_are_counted() -> None:
     trajectories[0, 0, -1, 0] += 3.0
     assert standing_moved(scene, trajectories) == pytest.approx(0.25)
     assert standing_moved(driving, trajectories) != standing_moved(driving, trajectories), "nobody stands: not a number"
+
+
+def test_the_spread_is_the_distance_of_last_positions_from_their_mean() -> None:
+    scene = straight_road(3)
+    scene.agents.predict[:] = torch.tensor([True, True, False])
+    rollouts = torch.zeros(4, 3, 80, 4)
+    rollouts[:, 0, -1, :2] = torch.tensor([[3.0, 4.0], [-3.0, -4.0], [3.0, -4.0], [-3.0, 4.0]])
+    rollouts[:, 2, -1, 0] = torch.tensor([0.0, 0.0, 100.0, 100.0])
+    everybody = torch.ones(3, dtype=torch.bool)
+    assert final_spread(scene, rollouts, everybody) == pytest.approx(5 / 2), "the third agent is not evaluated"
+    assert final_spread(scene, rollouts, everybody & (torch.arange(3) == 0)) == pytest.approx(5)
+    nobody = final_spread(scene, rollouts, ~everybody)
+    assert nobody != nobody, "not a number"
 
 
 # --- tokens ---------------------------------------------------------------------------------------------------------
