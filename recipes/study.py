@@ -42,15 +42,26 @@ def study(cfg: DictConfig, scenes: SceneStore, measure: Measure, decided_by: dic
     Raises:
         ValueError: no policy is given.
     """
+    policies = policies_of(cfg)
+    return {name: study_policy(cfg, scenes, path, measure, decided_by, name) for name, path in policies.items()}
+
+
+def policies_of(cfg: DictConfig) -> dict[str, Path]:
+    """Files of the policies that ``cfg.policies`` lists, by name.
+
+    Raises:
+        ValueError: it lists none.
+    """
     policies = named([cfg.policies] if isinstance(cfg.policies, str) else list(cfg.policies))
     if not policies:
         raise ValueError("policies=[] names no policy; say for example policies=[runs/pretrain/policy.pt].")
-    return {name: _measured(cfg, scenes, path, measure, decided_by, name) for name, path in policies.items()}
+    return policies
 
 
-def _measured(
+def study_policy(
     cfg: DictConfig, scenes: SceneStore, policy: Path, measure: Measure, decided_by: dict[str, Any], name: str
 ) -> list[dict]:
+    """What ``measure`` gives for each scene under one policy; arguments and files as in :func:`study`."""
     model, context, _ = open_policy(policy, cfg.device)
     options = decided_by | {
         "policy": weights_digest(model),
@@ -112,14 +123,14 @@ def over_scenes(values: np.ndarray, name: str) -> Interval:
 
 
 def as_json(content: Any) -> Any:
-    """Intervals anywhere in dicts and lists as plain JSON."""
+    """Intervals anywhere in dicts and lists as plain JSON; None where a number is not known."""
     if isinstance(content, Interval):
         return {"mean": content.mean, "ci95": [content.low, content.high], "scenes": content.num_scenes}
     if isinstance(content, dict):
         return {key: as_json(value) for key, value in content.items()}
-    return [as_json(value) for value in content]
+    return None if content is None else [as_json(value) for value in content]
 
 
-def shown(value: Interval) -> str:
+def shown(value: Interval | None) -> str:
     """Mean and interval in a cell of a table."""
-    return f"{value.mean:+.3f} [{value.low:+.3f}, {value.high:+.3f}]"
+    return "–" if value is None else f"{value.mean:+.3f} [{value.low:+.3f}, {value.high:+.3f}]"

@@ -76,6 +76,34 @@ def plot_sensitivity(
     save_figure(figure, path)
 
 
+def plot_discriminator(found: Mapping[str, Any], path: str | Path) -> None:
+    """Draw what a discriminator ranks rollouts by, beside the preference distance and ADE (METHOD figure 10).
+
+    Left Spearman of the score with what was measured of a rollout; below 0 the ranking prefers less of it. Right the
+    realism of the best and of the worst quarter, minus that of random groups.
+
+    Args:
+        found: ``correlation`` by quantity and ranking (None where nothing is ranked), and ``realism`` by ranking,
+            ``best`` or ``worst``, and figure.
+        path: PNG to write.
+    """
+    figure = blank_figure(10.5, 4)
+    left, right = figure.subplots(1, 2, width_ratios=[1.5, 1])
+    _dots(left, {quantity: values for quantity, values in found["correlation"].items() if None not in values.values()})
+    left.set_title("Spearman of the score with ... in a scene")
+    ends = {"best quarter": "best", "worst quarter": "worst"}
+    realism = found["realism"]
+    _dots(right, {title: {name: realism[name][end]["realism"] for name in realism} for title, end in ends.items()})
+    right.set_title("realism minus that of random rollouts")
+    for color, name in zip(_colours(len(realism) + 1), [*realism, "random"], strict=True):
+        left.plot([], [], "o", color=color, ms=5.5, label=name)
+    left.legend(frameon=False, fontsize=8, labelcolor=INK)
+    for axes in (left, right):
+        calm(axes, "x")
+        axes.tick_params(axis="y", length=0)
+    save_figure(figure, path)
+
+
 def _dots(axes: Axes, rows: Mapping[str, Mapping[str, Interval]]) -> None:
     """Means with intervals: a group of rows for each title, in it one for each name."""
     names = list(next(iter(rows.values())))

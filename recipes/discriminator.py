@@ -1,0 +1,285 @@
+"""What does a discriminator rank rollouts by (METHOD figure 10)?
+
+python -m recipes.discriminator policies=[runs/pretrain/policy.pt]
+
+For each policy a discriminator learns to tell the logs of the training scenes from the policy's rollouts of them. Then
+it ranks the rollouts of scenes that it has not seen: by how smooth they are, or by what they do? Run the same command
+again to go on after a kill.
+"""
+
+from __future__ import annotations
+
+import copy
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import hydra
+import torch
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from dpa.discriminator import Discriminator, mean_squared_jerk
+from dpa.policy import ContextOptions, Decoding
+from dpa.ranking import Distance, occupancy_features
+from dpa.realism import realism_of_groups
+from dpa.report.studies import plot_discriminator
+from dpa.rollout import make_collector
+from dpa.tokens import MotionTokenizer
+from dpa.training.checkpoint import load_policy, load_weights, save_policy
+from envs.progress import progress
+from envs.seeding import make_generator
+from envs.store import SceneStore
+from recipes.adversary import fit
+from recipes.cli import CONFIG, build, finished, finite, plain, recipe, write_json
+from recipes.models import open_policy, weights_digest
+from recipes.motions import MotionShelf, Sight, driven_log
+from recipes.rankings import build_distance
+from recipes.rolled import Rolled, rolled
+from recipes.scenes import fingerprint, open_splits
+from recipes.spurious import QUANTITIES, RANKINGS, summarise
+from recipes.study import as_json, policies_of, shown, study_policy
+
+FIGURES = ("realism", "kinematic", "interactive", "map_based")
+RANDOM_GROUPS = 8
+"""Groups of rollouts drawn at random from a scene: what a quarter scores that nothing has chosen."""
+SMALLEST = 8
+"""Rollouts of a scene that have quarters worth looking at."""
+
+
+def trained(cfg: DictConfig, scenes: SceneStore, policy: Path, name: str) -> tuple[Discriminator, dict[str, Any]]:
+    """The discriminator of a policy's rollouts, trained or read back, and how its training went.
+
+    Args:
+        cfg: options of the recipe.
+        scenes: to train on.
+        policy: whose rollouts it learns from.
+        name: of the policy.
+
+    Raises:
+        ValueError: the folder holds another training, or too few scenes have an agent to look at.
+    """
+    folder, sight = Path(cfg.output) / name.replace("/", "_"), build(Sight, cfg.sight, "sight")
+    result, weights = folder / "training.json", folder / "discriminator.pt"
+    model, context, _ = open_policy(policy, cfg.device)
+    shape = {"num_features": sight.width, "width": cfg.training.width}
+    decided_by = {
+        "policy": weights_digest(model),
+        "scenes": fingerprint(scenes),
+        "sight": plain(cfg.sight),
+        "training": plain(cfg.training),
+        "decoding": plain(cfg.decoding),
+        "seed": cfg.seed,
+    }
+    done = finished(result, decided_by)
+    if done is not None and weights.is_file():
+        net = Discriminator(**shape)
+        load_weights(net, *load_policy(weights)[:2], shape, where=str(weights))
+        return net.eval(), done
+    shelf = MotionShelf(folder / "motions", decided_by)
+    there = frozenset(shelf.scenes())
+    batches = make_collector(
+        scenes,
+        model,
+        num_rollouts=cfg.training.num_rollouts,
+        done=there,
+        decoding=build(Decoding, cfg.decoding, "decoding"),
+        options=context,
+        seed=cfg.seed,
+        memory=cfg.memory,
+        device=cfg.device,
+    )
+    see = partial(seen, sight=sight, tokenizer=copy.deepcopy(model.tokenizer).cpu(), options=context)
+    with progress(total=len(scenes), description=f"{name} rollouts", initial=len(there), unit="scene") as bar:
+        for each in rolled(batches, scenes, cfg.training.num_rollouts, there):
+            shelf.put(each.index, see(each)[0])
+            bar.update()
+    net, curve = fit(cfg.training, shape, shelf, folder, seed=cfg.seed, decided_by=decided_by, logger=cfg.logger)
+    save_policy(weights, net.state_dict(), shape, {"seed": cfg.seed})
+    best = min(curve, key=lambda look: look["held_out_loss"])
+    done = {"options": decided_by, "scenes": len(scenes), "best": best, "curve": curve}
+    write_json(result, done)
+    shelf.remove()
+    return net, done
+
+
+def seen(each: Rolled, sight: Sight, tokenizer: MotionTokenizer, options: ContextOptions) -> tuple[Any, Tensor]:
+    """The motions of a scene's log and rollouts, and the log ``[A, 80, 4]`` that they were compared with."""
+    log = driven_log(each.scene, tokenizer, options, tokenized=sight.tokenized)
+    return sight(each, log), log
+
+
+@torch.no_grad()
+def measure_scene(
+    each: Rolled,
+    net: Discriminator,
+    sight: Sight,
+    tokenizer: MotionTokenizer,
+    options: ContextOptions,
+    distance: Distance,
+    metric: str,
+    seed: int,
+) -> dict[str, Any]:
+    """Scores of all rollouts and of the log, what was measured of them, and the realism of every ranking's quarters.
+
+    Args:
+        each: scene and rollouts.
+        net: the discriminator.
+        sight: what it sees.
+        tokenizer: of the policy.
+        options: how the policy cuts scenes up.
+        distance: the preference distance.
+        metric: year of the realism metric, or a YAML.
+        seed: of the random groups.
+    """
+    motions, log = seen(each, sight, tokenizer, options)
+    score, log_score = net.score(motions.rollouts, motions.valid), net.score(motions.log, motions.valid)
+    ego = each.controlled.nonzero()[:, 0]
+    both = torch.cat((log[None], each.trajectories))
+    jerks = {
+        "jerk": mean_squared_jerk(each.scene, both, ego=ego),
+        "jerk_2hz": mean_squared_jerk(each.scene, both, ego=ego, stride=5),
+    }
+    ranking = distance(each.scene, each.trajectories, each.controlled)
+    quantity = {name: value[1:] for name, value in jerks.items()}
+    quantity |= {"distance": ranking.distance, "ade": ranking.ade, **event_rates(each)}
+    scores = {"discriminator": score, "distance": -ranking.distance, "ade": -ranking.ade}
+    return {
+        "score": score.tolist(),
+        "quantity": {name: quantity[name].tolist() for name in QUANTITIES},
+        "log": {"score": log_score.item(), **{name: value[0].item() for name, value in jerks.items()}},
+        "realism": realism_of_quarters(each, scores, metric, seed),
+    }
+
+
+def event_rates(each: Rolled) -> dict[str, Tensor]:
+    """``collision`` and ``offroad``: share of the controlled agents that ever do so in each rollout, ``[K]``."""
+    ego = each.controlled.nonzero()[:, 0]
+    names = ("clearance", "road_edge")
+    phi, valid = occupancy_features(each.scene, each.trajectories, names, ego=ego)
+    counted = valid.any(-1).sum().clamp(min=1)
+    touched, off = (((event & valid).any(-1).sum(-1) / counted) for event in (phi[..., 0] < 0, phi[..., 1] > 0))
+    return {"collision": touched, "offroad": off}
+
+
+def realism_of_quarters(each: Rolled, scores: dict[str, Tensor], metric: str, seed: int) -> dict[str, Any]:
+    """Realism of the ``best`` and ``worst`` quarter of each ranking, and the mean over ``random`` groups of that size.
+
+    Args:
+        each: scene and rollouts.
+        scores: ``[K]`` of each ranking, the best rollout with the highest; ties go to the smaller index.
+        metric: year of the realism metric, or a YAML.
+        seed: of the random groups.
+    """
+    size = len(each.trajectories) // 4
+    draw = make_generator(seed, "discriminator", each.index)
+    groups = [torch.randperm(len(each.trajectories), generator=draw)[:size] for _ in range(RANDOM_GROUPS)]
+    for score in scores.values():
+        order = score.argsort(descending=True, stable=True)
+        groups += [order[:size], order[-size:]]
+    results = realism_of_groups(each.scene, each.trajectories, groups, metric)
+    figures = [{figure: finite(getattr(result, figure)) for figure in FIGURES} for result in results]
+    random, chosen = figures[:RANDOM_GROUPS], iter(figures[RANDOM_GROUPS:])
+    return {name: {"best": next(chosen), "worst": next(chosen)} for name in scores} | {"random": _mean(random)}
+
+
+def _mean(groups: list[dict[str, float | None]]) -> dict[str, float | None]:
+    """Of each figure over groups; None where it is not defined."""
+    columns = {figure: [group[figure] for group in groups] for figure in FIGURES}
+    return {figure: None if None in values else sum(values) / len(values) for figure, values in columns.items()}
+
+
+def check(cfg: DictConfig) -> None:
+    """Refuse options before any work.
+
+    Raises:
+        ValueError: too few rollouts, a share that is none, a count that is not positive, or a split that is trained on.
+    """
+    if cfg.num_rollouts < SMALLEST:
+        raise ValueError(f"num_rollouts must be {SMALLEST} or more, got {cfg.num_rollouts}.")
+    if cfg.split == "train":
+        raise ValueError("split=train ranks the scenes that the discriminator learns from; say split=tune.")
+    if not 0 < cfg.training.held_out < 1:
+        raise ValueError(f"training.held_out must lie between 0 and 1, got {cfg.training.held_out}.")
+    for name in ("num_rollouts", "width", "steps", "batch_scenes", "look_interval", "patience", "checkpoint_interval"):
+        if not isinstance(cfg.training[name], int) or cfg.training[name] < 1:
+            raise ValueError(f"training.{name} must be a whole number of 1 or more, got {cfg.training[name]!r}.")
+
+
+@hydra.main(**CONFIG, config_name="discriminator")
+@recipe
+def main(cfg: DictConfig) -> None:
+    """Entry point of ``python -m recipes.discriminator``."""
+    check(cfg)
+    sight, distance = build(Sight, cfg.sight, "sight"), build_distance(cfg.ranking, "ranking")
+    policies, splits = policies_of(cfg), open_splits(cfg.scenes)
+    scenes, measured, training = splits[cfg.split], {}, {}
+    for name, path in policies.items():
+        net, training[name] = trained(cfg, splits.train, path, name)
+        model, context, _ = open_policy(path, "cpu")
+        decided_by = {
+            "discriminator": weights_digest(net),
+            "sight": plain(cfg.sight),
+            "ranking": distance.describe(),
+            "metric": cfg.metric,
+        }
+        measure = partial(
+            measure_scene,
+            net=net,
+            sight=sight,
+            tokenizer=model.tokenizer,
+            options=context,
+            distance=distance,
+            metric=cfg.metric,
+            seed=cfg.seed,
+        )
+        measured[name] = study_policy(cfg, scenes, path, measure, decided_by, name)
+    found, folder = summarise(measured), Path(cfg.output)
+    plot_discriminator(found, folder / "discriminator.png")
+    write_json(folder / "summary.json", summary_json(found, training, cfg, len(scenes)))
+    _print(found, training, len(scenes), cfg)
+    print(f"numbers of every scene, summary and figure: {folder}")
+
+
+def summary_json(found: dict[str, Any], training: dict[str, dict], cfg: DictConfig, num_scenes: int) -> dict[str, Any]:
+    """All that a report needs: what was found, and the training of each policy's discriminator."""
+    return as_json(found) | {
+        "labels": QUANTITIES,
+        "policies": {
+            name: {"best": done["best"], "curve": done["curve"], "training_scenes": done["scenes"]}
+            for name, done in training.items()
+        },
+        "scenes": num_scenes,
+        "num_rollouts": cfg.num_rollouts,
+        "sight": plain(cfg.sight),
+        "metric": cfg.metric,
+        "seed": cfg.seed,
+    }
+
+
+def _print(found: dict[str, Any], training: dict[str, dict], num_scenes: int, cfg: DictConfig) -> None:
+    head = f"{num_scenes} scenes, {len(training)} policies, {cfg.num_rollouts} rollouts: Spearman with the score of"
+    table = Table("within a scene", *RANKINGS, "random", "discriminator, jerk fixed", "distance fixed", title=head)
+    for quantity, title in QUANTITIES.items():
+        columns = [found["correlation"][quantity][name] for name in (*RANKINGS, "random")]
+        columns += [found["given"][quantity].get(fixed) for fixed in ("jerk", "distance")]
+        table.add_row(title, *map(shown, columns))
+    quarters = Table("ranking", "best quarter", "worst quarter", title=f"realism ({cfg.metric}) minus random groups")
+    for name in RANKINGS:
+        quarters.add_row(name, *(shown(found["realism"][name][end]["realism"]) for end in ("best", "worst")))
+    for name, value in found["minus"].items():
+        quarters.add_row(f"discriminator minus {name}", shown(value), "")
+    for each in (table, quarters):
+        Console(width=190).print(each)
+    for name, done in training.items():
+        step, loss, area = (done["best"][key] for key in ("step", "held_out_loss", "held_out_auc"))
+        print(f"{name}: held-out AUC {area:.3f}, loss {loss:.3f} after {step} steps")
+    print(f"rollouts that score below the log: {shown(found['auc']['discriminator'])}")
+    print(f"rollouts that are jerkier than the log: {shown(found['auc']['jerk'])}")
+    print(f"how much more by smoothness than by the distance: {shown(found['smoothness_minus_distance'])}")
+
+
+if __name__ == "__main__":
+    main()

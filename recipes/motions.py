@@ -1,0 +1,159 @@
+"""What a discriminator learns from: the log of a scene beside its rollouts, seen alike, and kept on disk until then."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dpa.discriminator import ROAD, observed_motion, width_of
+from dpa.policy import ContextOptions, make_context
+from dpa.rollout import lifted
+from dpa.tokens import MotionTokenizer
+from envs.scene import Scene
+from recipes.cli import write_json
+from recipes.rolled import Rolled
+
+
+class Motions(NamedTuple):
+    """The controlled agents of one scene, as a discriminator sees them.
+
+    Attributes:
+        log: ``[1, E, T, D]``.
+        rollouts: ``[K, E, T, D]``.
+        valid: ``[E, T]`` bool, the same for both.
+    """
+
+    log: Tensor
+    rollouts: Tensor
+    valid: Tensor
+
+
+@dataclass(frozen=True)
+class Sight:
+    """How a discriminator looks at scenes.
+
+    Args:
+        stride: see :func:`~dpa.discriminator.observed_motion`.
+        road: names of features that it sees of the road and of what is near.
+        tokenized: the log goes through tokens and back, as rollouts do. Otherwise motions that no token makes give the
+            log away.
+
+    Raises:
+        ValueError: ``tokenized`` is neither true nor false.
+
+    Examples:
+        >>> Sight().width
+        33
+    """
+
+    stride: int = 5
+    road: Sequence[str] = ROAD
+    tokenized: bool = True
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.tokenized, bool):
+            raise ValueError(f"tokenized must be true or false, got {self.tokenized!r}.")
+
+    @property
+    def width(self) -> int:
+        """D: numbers that are seen of an agent at a step."""
+        return width_of(self.road)
+
+    def __call__(self, each: Rolled, log: Tensor) -> Motions:
+        """See a scene's rollouts, and its log as ``[A, 80, 4]``."""
+        ego = each.controlled.nonzero()[:, 0]
+        both = torch.cat((log[None].to(each.trajectories), each.trajectories))
+        values, valid = observed_motion(each.scene, both, ego=ego, stride=self.stride, road=self.road)
+        return Motions(values[:1], values[1:], valid)
+
+
+def driven_log(scene: Scene, tokenizer: MotionTokenizer, options: ContextOptions, *, tokenized: bool) -> Tensor:
+    """The log as a policy would have driven it: by tokens, at the height of the road; others replay as in a rollout.
+
+    Args:
+        scene: uncollated.
+        tokenizer: of the policy.
+        options: how the policy cuts scenes up; they say whom it moves.
+        tokenized: otherwise controlled agents keep their logged poses.
+
+    Returns:
+        ``[A, 80, 4]`` x, y, z, heading of the present agents; past the first hole of a log it means nothing.
+
+    Examples:
+        >>> from dpa.tokens import VerletTokenizer
+        >>> from envs.sources.synthetic import straight_road
+        >>> scene, tokenizer = straight_road(2, seed=0), VerletTokenizer()
+        >>> sides = [driven_log(scene, tokenizer, ContextOptions(), tokenized=side) for side in (True, False)]
+        >>> 0 < (sides[0] - sides[1]).abs().max() < 0.3
+        tensor(True)
+    """
+    context = make_context(scene, options)
+    poses = context.logged
+    if tokenized:
+        tracks = tokenizer.encode_tracks(poses, context.logged_valid, context.recent, context.kind)
+        poses = torch.where(context.controlled[:, None, None], tracks.poses, poses)
+    return lifted(scene, poses[None])[0]
+
+
+class MotionShelf:
+    """A folder with the motions of scenes, one file each, which appears whole or not at all.
+
+    Numbers are kept as float16: nobody sees a centimetre at 50 m. What was kept with other options is removed.
+
+    Args:
+        folder: made if it is not there.
+        decided_by: all that decides the motions, ready for JSON.
+
+    Examples:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     shelf = MotionShelf(folder, {"seed": 0})
+        ...     valid = torch.ones(2, 16, dtype=torch.bool)
+        ...     shelf.put(3, Motions(torch.zeros(1, 2, 16, 33), torch.zeros(4, 2, 16, 33), valid))
+        ...     shelf.scenes(), shelf.get(3).rollouts.shape
+        ([3], torch.Size([4, 2, 16, 33]))
+    """
+
+    def __init__(self, folder: str | Path, decided_by: dict[str, Any]) -> None:
+        self.folder = Path(folder)
+        self._options = self.folder / "options.json"
+        if not self._options.is_file() or json.loads(self._options.read_text(encoding="utf-8")) != decided_by:
+            self.remove()
+            write_json(self._options, decided_by)
+
+    def scenes(self) -> list[int]:
+        """Scenes that are there, in order."""
+        return sorted(int(path.stem) for path in self.folder.glob("[0-9]*.npz"))
+
+    def put(self, scene: int, motions: Motions) -> None:
+        """Keep the motions of a scene."""
+        part = self.folder / f".{scene}.part"
+        with part.open("wb") as file:
+            np.savez(file, **{name: _small(value).numpy() for name, value in motions._asdict().items()})
+        part.replace(self.folder / f"{scene}.npz")
+
+    def get(self, scene: int) -> Motions:
+        """Read the motions of a scene."""
+        with np.load(self.folder / f"{scene}.npz", allow_pickle=False) as arrays:
+            parts = {name: torch.from_numpy(arrays[name]) for name in Motions._fields}
+        return Motions(**{name: part if part.dtype == torch.bool else part.float() for name, part in parts.items()})
+
+    def remove(self) -> None:
+        """Remove all that is kept, and the folder."""
+        self._options.unlink(missing_ok=True)
+        for path in (*self.folder.glob("[0-9]*.npz"), *self.folder.glob(".*.part")):
+            path.unlink()
+        if self.folder.is_dir():
+            self.folder.rmdir()
+
+
+def _small(value: Tensor) -> Tensor:
+    largest = torch.finfo(torch.float16).max  # an acceleration across a slip of a raw log can be beyond it
+    return value if value.dtype == torch.bool else value.clamp(-largest, largest).half()
