@@ -108,6 +108,15 @@ def split_of(scenes: Sequence[int], share: float, seed: int) -> tuple[list[int],
     return sorted(order[count:]), sorted(order[:count])
 
 
+def best_look(curve: Curve) -> dict[str, float]:
+    """The look of the largest held-out AUC, and of these the one of the least loss; the earliest of equals.
+
+    The loss is that of agents, and with few scenes it grows early, while the mean over the agents of a scene still tells
+    logs from rollouts better and better: what ranks is the score of a scene, so that decides.
+    """
+    return max(curve, key=lambda look: (look["held_out_auc"], -look["held_out_loss"]))
+
+
 @torch.no_grad()
 def measured_on(net: Discriminator, scenes: Sequence[Motions]) -> dict[str, float]:
     """``loss`` [nats] over all rollouts of some scenes, and ``auc`` of log against rollouts within a scene."""
@@ -123,11 +132,9 @@ def measured_on(net: Discriminator, scenes: Sequence[Motions]) -> dict[str, floa
 
 def _remember(state: dict[str, Any], step: int, train_loss: float, look: dict[str, float]) -> None:
     """Note a look; ``waited`` counts those since the best one."""
-    earlier = [entry["held_out_loss"] for entry in state["curve"]]
-    better = look["loss"] < min(earlier, default=float("inf"))
     entry = {"step": step, "train_loss": train_loss, "held_out_loss": look["loss"], "held_out_auc": look["auc"]}
     state["curve"] = [*state["curve"], entry]
-    state["waited"] = 0 if better else state["waited"] + 1
+    state["waited"] = 0 if best_look(state["curve"]) is entry else state["waited"] + 1
     state["loss"] = 0.0
 
 

@@ -32,7 +32,7 @@ from dpa.training.checkpoint import load_policy, load_weights, save_policy
 from envs.progress import progress
 from envs.seeding import make_generator
 from envs.store import SceneStore
-from recipes.adversary import fit
+from recipes.adversary import best_look, fit
 from recipes.cli import CONFIG, build, finished, finite, plain, recipe, write_json
 from recipes.models import open_policy, weights_digest
 from recipes.motions import MotionShelf, Sight, driven_log
@@ -98,8 +98,7 @@ def trained(cfg: DictConfig, scenes: SceneStore, policy: Path, name: str) -> tup
             bar.update()
     net, curve = fit(cfg.training, shape, shelf, folder, seed=cfg.seed, decided_by=decided_by, logger=cfg.logger)
     save_policy(weights, net.state_dict(), shape, {"seed": cfg.seed})
-    best = min(curve, key=lambda look: look["held_out_loss"])
-    done = {"options": decided_by, "scenes": len(scenes), "best": best, "curve": curve}
+    done = {"options": decided_by, "scenes": len(scenes), "best": best_look(curve), "curve": curve}
     write_json(result, done)
     shelf.remove()
     return net, done
@@ -278,7 +277,7 @@ def _print(found: dict[str, Any], training: dict[str, dict], num_scenes: int, cf
         print(f"{name}: held-out AUC {area:.3f}, loss {loss:.3f} after {step} steps")
     print(f"rollouts that score below the log: {shown(found['auc']['discriminator'])}")
     print(f"rollouts that are jerkier than the log: {shown(found['auc']['jerk'])}")
-    print(f"how much more by smoothness than by the distance: {shown(found['smoothness_minus_distance'])}")
+    print(f"|Spearman with jerk| minus |Spearman with the distance|: {shown(found['jerk_minus_distance'])}")
 
 
 if __name__ == "__main__":

@@ -14,9 +14,10 @@ from torch import Tensor
 
 from dpa.discriminator import ROAD, observed_motion, width_of
 from dpa.policy import ContextOptions, make_context
+from dpa.ranking.features import feature_names
 from dpa.rollout import lifted
 from dpa.tokens import MotionTokenizer
-from envs.scene import Scene
+from envs.scene import CURRENT_STEP, Scene
 from recipes.cli import write_json
 from recipes.rolled import Rolled
 
@@ -46,7 +47,7 @@ class Sight:
             log away.
 
     Raises:
-        ValueError: ``tokenized`` is neither true nor false.
+        ValueError: ``tokenized`` is neither true nor false, no such stride, or an unknown feature.
 
     Examples:
         >>> Sight().width
@@ -59,7 +60,10 @@ class Sight:
 
     def __post_init__(self) -> None:
         if not isinstance(self.tokenized, bool):
-            raise ValueError(f"tokenized must be true or false, got {self.tokenized!r}.")
+            raise ValueError(f"sight.tokenized must be true or false, got {self.tokenized!r}.")
+        if not isinstance(self.stride, int) or not 1 <= self.stride <= CURRENT_STEP:
+            raise ValueError(f"sight.stride must be 1 to {CURRENT_STEP}, the history of a scene, got {self.stride!r}.")
+        feature_names(self.road)
 
     @property
     def width(self) -> int:

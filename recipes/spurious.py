@@ -108,9 +108,9 @@ def summarise(measured: dict[str, list[dict]]) -> dict[str, Any]:
     Returns:
         ``auc`` of the discriminator and of either jerk alone (share of rollouts that have more of it than the log);
         ``correlation`` of each ranking and of ``random`` scores with each quantity, ``minus_random`` of the
-        discriminator, and ``given`` (partial, with another quantity held fixed); ``smoothness_minus_distance``: how
-        much more the discriminator goes by smoothness than by the preference distance, above 0 where the paper's claim
-        holds; ``realism`` of the ``best`` and the ``worst`` quarter of each ranking minus that of random groups; and
+        discriminator, and ``given`` (partial, with another quantity held fixed); ``jerk_minus_distance``: how much more
+        strongly the discriminator goes with jerk than with the preference distance, absolute correlations of each
+        scene; ``realism`` of the ``best`` and the ``worst`` quarter of each ranking minus that of random groups; and
         ``minus``, that of the discriminator's best quarter minus that of another ranking. An entry is None where no
         scene tells rollouts apart.
 
@@ -126,7 +126,8 @@ def summarise(measured: dict[str, list[dict]]) -> dict[str, Any]:
         given[quantity] = {
             fixed: known(found.given("discriminator", quantity, fixed)) for fixed in GIVEN if fixed != quantity
         }
-    contrast = found.correlation("discriminator", "distance") - found.correlation("discriminator", "jerk")
+    # Logs may be the smoother side or the rougher one, so what counts is the strength and not the sign.
+    jerk, distance = (np.abs(found.correlation("discriminator", quantity)) for quantity in ("jerk", "distance"))
     figures = list(found.rows[0][found._with_realism()[0]]["realism"]["random"])
     best = {name: found.realism(name, "best", "realism") for name in RANKINGS}
     return {
@@ -134,7 +135,7 @@ def summarise(measured: dict[str, list[dict]]) -> dict[str, Any]:
         "correlation": correlation,
         "minus_random": minus_random,
         "given": given,
-        "smoothness_minus_distance": over_scenes(contrast, "discriminator"),
+        "jerk_minus_distance": over_scenes(jerk - distance, "discriminator"),
         "realism": {
             name: {
                 end: {f: paired_bootstrap(found.realism(name, end, f), found.random_realism(f)) for f in figures}

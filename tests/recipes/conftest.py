@@ -57,6 +57,7 @@ SECTIONS = {
     "look": ("threads", "scenes"),
     "validity": ("threads", "scenes"),
     "sensitivity": ("threads", "scenes"),
+    "discriminator": ("threads", "scenes"),
     "compare": ("threads", "scenes", "model", "pretraining", "collection", "alignment", "evaluation"),
 }
 
