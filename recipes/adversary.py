@@ -111,8 +111,8 @@ def split_of(scenes: Sequence[int], share: float, seed: int) -> tuple[list[int],
 def best_look(curve: Curve) -> dict[str, float]:
     """The look of the largest held-out AUC, and of these the one of the least loss; the earliest of equals.
 
-    The loss is that of agents, and with few scenes it grows early, while the mean over the agents of a scene still tells
-    logs from rollouts better and better: what ranks is the score of a scene, so that decides.
+    The loss is that of agents, and with few scenes it grows early, while the mean over the agents of a scene still
+    tells logs from rollouts better and better: what ranks is the score of a scene, so that decides.
     """
     return max(curve, key=lambda look: (look["held_out_auc"], -look["held_out_loss"]))
 

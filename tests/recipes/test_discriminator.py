@@ -36,16 +36,15 @@ SMALL += ["training.checkpoint_interval=2", "training.width=8", "training.held_o
 
 
 @pytest.fixture(scope="module")
-def policies(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Two untrained policies, as an option."""
-    folder = tmp_path_factory.mktemp("policies")
+def policy(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """An untrained policy, as an option."""
+    folder = tmp_path_factory.mktemp("policies") / "a"
+    folder.mkdir()
     with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):
         config = policy_config(compose("pretrain", ["model=nano"]).model)
-    for seed in (0, 1):
-        torch.manual_seed(seed)
-        (folder / str(seed)).mkdir()
-        write_policy(folder / f"{seed}/policy.pt", build_policy(config), config, {})
-    return f"policies=[{folder}/0/policy.pt,{folder}/1/policy.pt]"
+    torch.manual_seed(0)
+    write_policy(folder / "policy.pt", build_policy(config), config, {})
+    return f"policies={folder}/policy.pt"
 
 
 def configuration(*more: str) -> DictConfig:
@@ -228,20 +227,20 @@ def test_scenes_without_realism_are_refused() -> None:
 
 # --- the recipe -----------------------------------------------------------------------------------------------------
 def test_the_recipe_goes_on_after_a_kill_and_gives_what_it_would_have_given(
-    run: Callable, options: Callable, policies: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Callable, options: Callable, policy: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = run("discriminator", *options("discriminator", policies, *SMALL, f"output={tmp_path / 'whole'}"))
+    whole = run("discriminator", *options("discriminator", policy, *SMALL, f"output={tmp_path / 'whole'}"))
     assert whole.status == 0, whole.err
     assert "held-out AUC" in whole.out and "mean squared jerk" in whole.out
     summary = json.loads((tmp_path / "whole/summary.json").read_text())
-    assert set(summary["correlation"]) == set(QUANTITIES) and list(summary["policies"]) == ["0", "1"]
-    assert [look["step"] for look in summary["policies"]["0"]["curve"]] == [2, 4, 6]
+    assert set(summary["correlation"]) == set(QUANTITIES) and list(summary["policies"]) == ["a"]
+    assert [look["step"] for look in summary["policies"]["a"]["curve"]] == [2, 4, 6]
     assert summary["correlation"]["jerk"]["discriminator"]["scenes"] == 2 == summary["scenes"]
     assert summary["realism"]["distance"]["best"]["realism"]["ci95"]
     assert (tmp_path / "whole/discriminator.png").stat().st_size > 10_000
-    assert not (tmp_path / "whole/0/motions").exists()
+    assert not (tmp_path / "whole/a/motions").exists()
 
-    command = options("discriminator", policies, *SMALL, f"output={tmp_path / 'killed'}")
+    command = options("discriminator", policy, *SMALL, f"output={tmp_path / 'killed'}")
     for place, after in (("seen", 4), ("measure_scene", 1)):
         real, calls = getattr(discriminator, place), []
 
@@ -255,11 +254,10 @@ def test_the_recipe_goes_on_after_a_kill_and_gives_what_it_would_have_given(
             patch.setattr(discriminator, place, killed)
             assert run("discriminator", *command).status == 130
     assert run("discriminator", *command).status == 0
-    for name in ("0", "1"):
-        first, second = (load_policy(tmp_path / side / name / "discriminator.pt")[0] for side in ("whole", "killed"))
-        assert all(torch.equal(value, second[key]) for key, value in first.items())
-        mine, theirs = (json.loads((tmp_path / side / f"{name}.json").read_text()) for side in ("whole", "killed"))
-        assert mine == theirs
+    first, second = (load_policy(tmp_path / side / "a/discriminator.pt")[0] for side in ("whole", "killed"))
+    assert all(torch.equal(value, second[key]) for key, value in first.items())
+    mine, theirs = (json.loads((tmp_path / side / "a.json").read_text()) for side in ("whole", "killed"))
+    assert mine == theirs
     assert json.loads((tmp_path / "killed/summary.json").read_text()) == summary
 
     for place in ("fit", "measure_scene"):
@@ -296,10 +294,10 @@ def test_scores_are_those_of_the_network_and_rates_those_of_the_events() -> None
     ],
 )
 def test_a_wrong_option_is_one_clear_sentence(
-    run: Callable, options: Callable, policies: str, tmp_path: Path, more: list[str], message: str
+    run: Callable, options: Callable, policy: str, tmp_path: Path, more: list[str], message: str
 ) -> None:
     more = [f"+{option}" if option.startswith("ranking.kind") else option for option in more]
-    outcome = run("discriminator", *options("discriminator", policies, *SMALL, f"output={tmp_path / 'out'}", *more))
+    outcome = run("discriminator", *options("discriminator", policy, *SMALL, f"output={tmp_path / 'out'}", *more))
     assert outcome.status == 2
     assert re.search(message, outcome.err), outcome.err
 
