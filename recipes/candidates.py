@@ -217,7 +217,9 @@ def _check(data: DictConfig, store: PreferenceStore) -> None:
         return
     for name in ("num", "num_unpreferred") if data.kind == "sets" else ("num",):
         if not isinstance(data[name], int):
-            raise ValueError(f"method.data.{name} must be a whole number, or a share between 0 and 1, got {data[name]!r}.")
+            raise ValueError(
+                f"method.data.{name} must be a whole number, or a share between 0 and 1, got {data[name]!r}."
+            )
         if data[name] < 1:
             raise ValueError(f"method.data.{name} must be 1 or more, got {data[name]}.")
     _check_enough(data, store)

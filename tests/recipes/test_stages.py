@@ -276,7 +276,10 @@ def test_a_margin_leaves_the_clear_pairs(runs: Path, options: Callable) -> None:
         ({"kind": "best", "num": 0}, "method.data.num must be 1 or more, got 0"),
         ({"kind": "best", "num": 5}, "method.data.num=5 needs 5 rollouts of a scene and the store holds 4"),
         ({"kind": "sets", "num_unpreferred": 3}, "num=2 and num_unpreferred=3 needs 5 rollouts"),
-        ({"kind": "sets", "num_unpreferred": None}, "num_unpreferred must be a whole number, or a share between 0 and 1, got None"),
+        (
+            {"kind": "sets", "num_unpreferred": None},
+            "num_unpreferred must be a whole number, or a share between 0 and 1, got None",
+        ),
         ({"num": 1.5}, "method.data.num must be a whole number, or a share between 0 and 1, got 1.5"),
         ({"kind": "ranking", "num": 1}, "a ranking needs two rollouts, got method.data.num=1"),
         ({"kind": "expert"}, "needs rollouts of an expert, and there are none"),
