@@ -475,22 +475,23 @@
     ctx.fillText(most.toFixed(1), right + 5, 12);
   }
 
-  const percent = (part) => part > 0 && part < 0.01 ? "under 1 %" : Math.round(100 * part) + " %";
+  const GAP = "\u00a0";                // between a number and its unit, where no line may break
+  const percent = (part) => part > 0 && part < 0.01 ? `under 1${GAP}%` : `${Math.round(100 * part)}${GAP}%`;
   const plural = (count, name) => `${count} ${name}${count === 1 ? "" : "s"}`;
-  const signed = (seconds) => (seconds < -0.05 ? "−" : "+") + Math.abs(seconds).toFixed(1) + " s";
+  const signed = (seconds) => (seconds < -0.05 ? "−" : "+") + Math.abs(seconds).toFixed(1) + GAP + "s";
 
   function sentenceOf(scene, entry) {
     const name = scene.agents[entry.agent].replace(/^./, (letter) => letter.toUpperCase()), pairs = entry.pairs, steps = plural(pairs.length, "step");
     if (!entry.paid) return `${name} pays nothing: this rollout drives it as the log does.`;
     const [feature, share] = entry.shares.reduce((a, b) => b[1] > a[1] ? b : a);
-    const pays = `${name} pays ${percent(entry.part)} of this rollout's distance (${entry.paid.toFixed(1)}), most of it for ${feature} (${share} %).`;
+    const pays = `${name} pays ${percent(entry.part)} of this rollout's distance (${entry.paid.toFixed(1)}), most of it for ${feature} (${share}${GAP}%).`;
     const away = pairs.filter((pair) => Math.abs(pair.log - pair.rollout) > NEAR + 1e-6);
-    if (!away.length) return `${pays} All ${steps} lie on the diagonal: they are coupled with the same moment of the log, give or take ${NEAR} s.`;
+    if (!away.length) return `${pays} All ${steps} lie on the diagonal: they are coupled with the same moment of the log, give or take ${NEAR}${GAP}s.`;
     const mean = away.reduce((sum, pair) => sum + Math.abs(pair.log - pair.rollout), 0) / away.length;
     const how = away.length === pairs.length ? `None of the ${steps} is` : `${pairs.length - away.length} of ${steps} are`;
     const late = away.filter((pair) => pair.log < pair.rollout).length / away.length;
     const when = late > 0.65 ? " earlier in the log: the rollout is late" : late < 0.35 ? " later in the log: the rollout is ahead of it" : " away";
-    return `${pays} ${how} coupled with the same moment of the log, give or take ${NEAR} s; the others find what is like them ${mean.toFixed(1)} s${when}.`;
+    return `${pays} ${how} coupled with the same moment of the log, give or take ${NEAR}${GAP}s; the others find what is like them ${mean.toFixed(1)}${GAP}s${when}.`;
   }
 
   function momentOf(entry) {
@@ -498,7 +499,7 @@
     if (!pair) return state.time <= data.now + 1e-6 ? "Until 0 s the rollout is the log." : "At this moment the log has no valid step, so nothing is coupled.";
     const { features } = sceneAt(state.scene).rollouts[state.method];
     const apart = features.map(({ weight }, k) => weight * (pair.values[0][k] - pair.values[1][k]) ** 2), most = apart.indexOf(Math.max(...apart));
-    const [mine, theirs] = pair.values.map((values) => values[most].toFixed(1).replace("-", "−")), unit = features[most].unit === "1" ? "" : " " + features[most].unit;
+    const [mine, theirs] = pair.values.map((values) => values[most].toFixed(1).replace("-", "−")), unit = features[most].unit === "1" ? "" : GAP + features[most].unit;
     const why = pair.cost < 0.05 ? "" : ` The most of it is ${features[most].name}: ${mine}${unit} in the rollout, ${theirs}${unit} in the log.`;
     return `At ${signed(pair.rollout)} the rollout is coupled with ${signed(pair.log)} of the log, at a cost of ${pair.cost.toFixed(1)}.${why}`;
   }
@@ -510,7 +511,7 @@
       label.textContent = name;
       fill.style.width = share + "%";
       bar.append(fill);
-      value.textContent = share + " %";
+      value.textContent = share + GAP + "%";
       cells.push(label, bar, value);
     }
     $("parts").replaceChildren(...cells);

@@ -45,7 +45,7 @@ class Player:
         return self.page.locator(f"#player-{name}")
 
     def text(self, name: str) -> str:
-        return self[name].inner_text()
+        return self[name].inner_text().replace("\u00a0", " ")
 
     def at(self, seconds: float) -> None:
         self["time"].fill(str(10 + 10 * seconds))
@@ -54,7 +54,7 @@ class Player:
     def choose(self, name: str, label: str | re.Pattern[str]) -> None:
         if isinstance(label, re.Pattern):
             label = next(text for text in self.options(name) if label.search(text))
-        self[name].select_option(label=label)
+        self[name].select_option(index=self.options(name).index(label))
         self.page.evaluate(SETTLE)
 
     def click(self, name: str, **options: Any) -> None:
@@ -62,10 +62,10 @@ class Player:
         self.page.evaluate(SETTLE)
 
     def options(self, name: str) -> list[str]:
-        return self[name].locator("option").all_inner_texts()
+        return [text.replace("\u00a0", " ") for text in self[name].locator("option").all_inner_texts()]
 
     def chosen(self, name: str) -> str:
-        return self[name].evaluate("select => select.selectedOptions[0].text")
+        return self[name].evaluate("select => select.selectedOptions[0].text.replaceAll('\\u00a0', ' ')")
 
     def picture(self, name: str) -> str:
         return self[name].evaluate("canvas => canvas.toDataURL()")
