@@ -316,6 +316,28 @@ def test_nothing_is_wider_than_the_screen(open_player: Callable[..., Player], wi
     assert log["width"] > 0.8 * width or width > 700
 
 
+def test_two_fingers_zoom_and_choose_nobody(open_player: Callable[..., Player]) -> None:
+    player = open_player(viewport={"width": 390, "height": 844}, has_touch=True)
+    before, chosen, box = player.picture("log"), player.chosen("agent"), player["log"].bounding_box()
+    touch = player.page.context.new_cdp_session(player.page)
+
+    def fingers(kind: str, *away: float) -> None:
+        middle = box["x"] + box["width"] / 2
+        points = [{"x": middle + x, "y": box["y"] + 60, "id": number} for number, x in enumerate(away)]
+        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    fingers("touchStart", -20, 20)
+    for step in range(1, 8):
+        fingers("touchMove", -20 - 10 * step, 20 + 10 * step)
+    fingers("touchEnd")
+    player.page.evaluate(SETTLE)
+    assert player.picture("log") != before and player.chosen("agent") == chosen
+    scale = player.page.evaluate("visualViewport.scale")
+    assert scale == 1
+    player.click("fit")
+    assert player.picture("log") == before
+
+
 def test_a_tap_plays(open_player: Callable[..., Player]) -> None:
     player = open_player(viewport={"width": 390, "height": 844}, has_touch=True, device_scale_factor=2)
     player["play"].tap()
