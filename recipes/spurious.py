@@ -19,7 +19,7 @@ QUANTITIES = {
     "collision": "collision rate",
     "offroad": "off-road rate",
 }
-"""What is measured of a rollout, none of it by the discriminator; less is better of each."""
+"""What is measured of a rollout, none of it by the discriminator."""
 RANKINGS = ("discriminator", "distance", "ade")
 """Ways to rank; the last two prefer the rollout nearest to the log."""
 GIVEN = ("jerk", "distance")
