@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 
 from dpa.losses import SaturationWatch
 from dpa.preferences import PreferenceStore
-from dpa.report.figures import read_curves
+from dpa.report.curves import read_curves
 from dpa.training.batches import ShuffledOrder
 from dpa.training.distributed import ALONE, Ranks, join_ranks
 from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule

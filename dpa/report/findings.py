@@ -5,104 +5,94 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from dpa.report.table import REFERENCE, signed, summarise
+from dpa.report.experiment import Decoding, Experiment, decoding_of, in_words
+from dpa.report.table import REFERENCE, signed
+
+FEW_SEEDS = 5
+"""With fewer training runs a bootstrap interval is too narrow; see :func:`dpa.report.statistics.paired_bootstrap`."""
 
 
-def headline(comparison: Mapping[str, Any], method: str | None = None) -> str:
+def headline(experiment: Experiment) -> str:
     """The result in one sentence that claims no more than the interval does.
 
-    Args:
-        comparison: see :mod:`dpa.report`.
-        method: whose difference to the reference is told; the first entry of ``paired`` by default. Fix it before the
-            numbers are known: the best of several methods is better than it deserves.
-
-    Raises:
-        ValueError: the method was not compared.
-
-    Examples:
-        >>> rows = [{"method": "reference", "realism": 0.700}, {"method": "DPA-OMF", "realism": 0.704}]
-        >>> paired = [{"method": "DPA-OMF", "realism_difference": 0.004, "ci95": [-0.002, 0.010]}]
-        >>> headline({"rows": rows, "paired": paired, "scenes": {"eval": 54}})
-        'No claim: DPA-OMF differs from the reference by +0.004 realism on 54 scenes, and the 95 % interval \
-[−0.002, +0.010] contains 0.'
+    It is about the method that ``experiment.headline`` names, at its own best decoding against the reference at its
+    own: a gain that sharper sampling of the reference reaches too is none.
     """
-    entry = _entry(comparison, method)
+    entry = experiment.own_best.entry(experiment.headline)
     if entry is None:
         return "No claim: no method was compared with the reference."
     low, high = entry["ci95"]
-    name = _name(entry)
-    scenes = f"on {comparison['scenes']['eval']} scenes"
+    name, where = experiment.label(experiment.headline), f"on {experiment.scenes['eval']} scenes"
     interval = f"95 % interval [{signed(low)}, {signed(high)}]"
     if low <= 0 <= high:
         change = signed(entry["realism_difference"])
         return (
-            f"No claim: {name} differs from the reference by {change} realism {scenes}, and the {interval} contains 0."
+            f"No claim: each at its own best decoding, {name} differs from the reference by {change} realism {where}, "
+            f"and the {interval} contains 0."
         )
-    size = f"{abs(entry['realism_difference']):.3f}"
-    if high < 0:
-        return f"{name} is {size} less realistic than the reference {scenes} ({interval})."
-    sentence = f"{name} is {size} more realistic than the reference {scenes} ({interval})"
-    best = _best(comparison, REFERENCE)
-    mine = _best(comparison, entry["method"])
-    if best is not None and mine is not None and best["realism"] >= mine["realism"]:
-        return f"{sentence}, but the reference alone, sampled at top-p {best['top_p']:g}, is as realistic."
-    return f"{sentence}."
+    size, word = f"{abs(entry['realism_difference']):.3f}", "more" if low > 0 else "less"
+    return f"Each at its own best decoding, {name} is {size} {word} realistic than the reference {where} ({interval})."
 
 
-def reservations(comparison: Mapping[str, Any], method: str | None = None) -> list[str]:
-    """What a reader must know before believing :func:`headline`; the arguments are the same.
+def reservations(experiment: Experiment, num_compared: int | None = None) -> list[str]:
+    """What a reader must know before believing :func:`headline`.
 
-    Examples:
-        >>> rows = [{"method": "reference", "realism": 0.70, "top_p": 0.95}, {"method": "SFT-bestOA", "realism": 0.71}]
-        >>> paired = [{"method": "SFT-bestOA", "realism_difference": 0.01, "ci95": [0.0, 0.02], "over": "scenes"}]
-        >>> reservations({"rows": rows, "paired": paired, "scenes": {"eval": 54}})[0]
-        'One training run: the interval covers the choice of scenes, not the spread between training runs.'
+    Args:
+        experiment: that the headline is of.
+        num_compared: differences with an interval that stand on the page; by default those of the experiment.
     """
-    entry = _entry(comparison, method)
+    own = experiment.own_best
+    entry = own.entry(experiment.headline)
     notes = []
-    if entry is not None and entry.get("over", "scenes") == "scenes":
+    if entry is not None and entry["over"] == "scenes":
         notes.append(
             "One training run: the interval covers the choice of scenes, not the spread between training runs."
         )
-    elif entry is not None and entry.get("n_seeds", 2) < 5:
+    elif entry is not None and entry["n_seeds"] < FEW_SEEDS:
         notes.append(f"{entry['n_seeds']} training runs: an interval over so few is a little too narrow.")
-    notes += _decoding(comparison, entry)
-    if len(comparison["paired"]) > 1:
-        notes.append(f"{len(comparison['paired'])} comparisons stand here; their intervals are not corrected for that.")
+    if entry is not None:
+        notes += _decoding(experiment, entry)
+    compared = len(own.paired) + len(experiment.at_common.paired) if num_compared is None else num_compared
+    if compared > 1:
+        notes.append(f"{compared} differences stand on this page; their intervals are not corrected for that.")
     notes.append(
-        f"Scores on {comparison['scenes']['eval']} scenes compare the methods of this page with each other, "
+        f"Scores on {experiment.scenes['eval']} scenes compare the methods of this page with each other, "
         "not with published tables."
     )
     return notes
 
 
-def _decoding(comparison: Mapping[str, Any], entry: Mapping[str, Any] | None) -> list[str]:
-    """Sharper sampling of the reference can gain as much as alignment does: say whether that was looked at."""
-    if entry is None:
-        return []
-    tried = sorted({row.get("top_p") for row in comparison["rows"] if row["method"] == REFERENCE} - {None})
-    if len(tried) < 2:
-        return ["The reference was sampled in one way only; sharper sampling of it alone may gain as much."]
-    best = _best(comparison, REFERENCE)
-    return [f"The reference alone reaches {best['realism']:.3f}, at top-p {best['top_p']:g} (of {len(tried)} tried)."]
+def _decoding(experiment: Experiment, entry: Mapping[str, Any]) -> list[str]:
+    """Sharper sampling can gain as much as alignment does: say how well that was looked at, and what it gave."""
+    grid, notes = experiment.grid(), []
+    if len(grid) < 2:
+        return ["One decoding was tried; sharper sampling of the reference alone may gain as much."]
+    common = experiment.at_common.entry(experiment.headline)
+    if common is not None and common["ci95"][0] > 0 and entry["ci95"][0] <= 0:
+        notes.append("The gain at the common decoding does not outlast the best decoding of the reference.")
+    sharper = [e for e in experiment.at_common.paired if e["method"] == REFERENCE]
+    if sharper:
+        best = max(sharper, key=lambda e: e["realism_difference"])
+        notes.append(
+            f"Sampling alone moves the reference by up to {signed(best['realism_difference'])} "
+            f"(at {in_words(decoding_of(best))} instead of {in_words(experiment.common)})."
+        )
+    edges = [
+        f"{experiment.label(method)} ({in_words(experiment.chosen[method])})"
+        for method in (REFERENCE, experiment.headline)
+        if method in experiment.chosen and _at_edge(experiment.chosen[method], grid)
+    ]
+    if edges:
+        notes.append(
+            f"Chosen at the edge of the {len(grid)} decodings tried: {', '.join(edges)}; one beyond may be better."
+        )
+    return notes
 
 
-def _entry(comparison: Mapping[str, Any], method: str | None) -> Mapping[str, Any] | None:
-    paired = comparison["paired"]
-    if method is None:
-        return paired[0] if paired else None
-    for entry in paired:
-        if entry["method"] == method:
-            return entry
-    raise ValueError(f"{method!r} was not compared with the reference; compared are {[e['method'] for e in paired]}.")
-
-
-def _best(comparison: Mapping[str, Any], method: str) -> dict[str, Any] | None:
-    """The method's most realistic record among several ways to sample it; None if none has a realism and a top-p."""
-    records = [r for r in summarise(comparison["rows"]) if r["method"] == method and r["realism"] is not None]
-    records = [r for r in records if r["top_p"] is not None]
-    return max(records, key=lambda record: record["realism"], default=None)
-
-
-def _name(entry: Mapping[str, Any]) -> str:
-    return entry["method"] if entry.get("top_p") is None else f"{entry['method']} (top-p {entry['top_p']:g})"
+def _at_edge(chosen: Decoding, grid: list[Decoding]) -> bool:
+    """A neighbour beyond the grid was never tried; beyond top-p 1 there is none."""
+    for place, value in enumerate(chosen):
+        tried = sorted({decoding[place] for decoding in grid})
+        if len(tried) > 1 and (value == tried[0] or (value == tried[-1] and not (place == 0 and value == 1))):
+            return True
+    return False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from rich.box import SIMPLE_HEAD
@@ -48,18 +48,22 @@ COLUMNS = (
 """Measures in the order of METHOD table 1, then safety, then the preference distance and table 3's accuracy."""
 
 DIFFERENCE_TITLE = "Δ realism [95 %]"
+IDENTITY = ("method", "seed", "top_p", "temperature", "file", "n_scenes")
+"""Entries of a row that are no measures."""
 
 
-def summarise(rows: Sequence[dict[str, Any]], paired: Sequence[dict[str, Any]] = ()) -> list[dict[str, Any]]:
-    """One record for each method and top-p: means over seeds, with the paired difference beside them.
+def summarise(rows: Sequence[Mapping[str, Any]], paired: Sequence[Mapping[str, Any]] = ()) -> list[dict[str, Any]]:
+    """One record for each method and decoding: means over seeds, with the paired difference beside them.
 
     Args:
-        rows: the comparison's rows; a measure may be None or absent, ``top_p`` and ``seed`` too.
-        paired: the comparison's paired differences; an entry with a ``top_p`` belongs to that one only.
+        rows: the comparison's rows; a measure may be None or absent, ``top_p``, ``temperature`` and ``seed`` too.
+        paired: the comparison's paired differences; an entry with a ``top_p`` or a ``temperature`` belongs to that
+            decoding only.
 
     Returns:
-        Records ``{"method", "top_p", "n_seeds", "n_scenes", <every COLUMNS key>, "realism_difference", "ci95"}`` in the
-        order of first appearance. A mean over seeds of which one has no value is None.
+        Records ``{"method", "top_p", "temperature", "n_seeds", "n_scenes", <every COLUMNS key and measure of a row>,
+        "realism_difference", "ci95"}`` in the order of first appearance. A mean over seeds of which one has no value is
+        None.
 
     Raises:
         ValueError: a NaN, or a paired entry that fits no record or several.
@@ -70,15 +74,17 @@ def summarise(rows: Sequence[dict[str, Any]], paired: Sequence[dict[str, Any]] =
         >>> round(record["realism"], 3), record["n_seeds"], record["pair_accuracy"]
         (0.71, 2, None)
     """
-    groups: dict[tuple[str, float | None], list[dict[str, Any]]] = {}
+    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for row in rows:
-        groups.setdefault((row["method"], row.get("top_p")), []).append(row)
+        groups.setdefault((row["method"], row.get("top_p"), row.get("temperature")), []).append(row)
+    measures = dict.fromkeys([column.key for column in COLUMNS] + [key for row in rows for key in row])
     records = []
-    for (method, top_p), members in groups.items():
-        record = {"method": method, "top_p": top_p, "n_seeds": len(members), "n_scenes": members[0].get("n_scenes")}
-        record |= {
-            column.key: _mean([row.get(column.key) for row in members], method, column.key) for column in COLUMNS
-        }
+    for (method, top_p, temperature), members in groups.items():
+        record = {"method": method, "top_p": top_p, "temperature": temperature, "n_seeds": len(members)}
+        record["n_scenes"] = members[0].get("n_scenes")
+        for key in measures:
+            if key not in IDENTITY:
+                record[key] = _mean([row.get(key) for row in members], method, key)
         records.append(record | {"realism_difference": None, "ci95": None})
     for entry in paired:
         record = _owner(entry, records)
@@ -89,7 +95,7 @@ def summarise(rows: Sequence[dict[str, Any]], paired: Sequence[dict[str, Any]] =
 def header(records: Sequence[dict[str, Any]]) -> list[str]:
     """Titles of the columns that :func:`cells` fills."""
     measures = [f"{column.title} {column.better}" for column in COLUMNS]
-    return ["method", *(["top-p"] if _shows_top_p(records) else []), "seeds", *measures, DIFFERENCE_TITLE]
+    return ["method", *(title for title, _ in _decoding(records)), "seeds", *measures, DIFFERENCE_TITLE]
 
 
 def cells(records: Sequence[dict[str, Any]]) -> list[list[str]]:
@@ -99,11 +105,11 @@ def cells(records: Sequence[dict[str, Any]]) -> list[list[str]]:
         >>> cells(summarise([{"method": "reference", "realism": 0.7}]))[0][:6]
         ['reference', '1', '–', '–', '–', '0.700']
     """
-    show_top_p = _shows_top_p(records)
+    decoding = _decoding(records)
     return [
         [
             record["method"],
-            *([number(record["top_p"], 2)] if show_top_p else []),
+            *(number(record[key], 2) for _, key in decoding),
             str(record["n_seeds"]),
             *(number(record[column.key], column.digits) for column in COLUMNS),
             difference(record["realism_difference"], record["ci95"]),
@@ -143,6 +149,23 @@ def difference(mean: float | None, interval: Sequence[float] | None) -> str:
     if mean is None or interval is None:
         return MISSING
     return f"{signed(mean)} [{signed(interval[0])}, {signed(interval[1])}]"
+
+
+def duration(seconds: float) -> str:
+    """A time span for people, in its two largest units.
+
+    Examples:
+        >>> duration(4321), duration(59.6), duration(0.25)
+        ('1 h 12 min', '1 min 0 s', '0.2 s')
+    """
+    if seconds < 10:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    return f"{whole // 3600} h {whole % 3600 // 60} min"
 
 
 def to_rich(
@@ -194,8 +217,10 @@ def to_markdown(rows: Sequence[dict[str, Any]], paired: Sequence[dict[str, Any]]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines) + "\n"
 
 
-def _shows_top_p(records: Sequence[dict[str, Any]]) -> bool:
-    return any(record["top_p"] is not None for record in records)
+def _decoding(records: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
+    """Titles and keys of what is told of the decoding; a temperature of 1 is not."""
+    told = {"top-p": ("top_p", {None}), "temperature": ("temperature", {None, 1.0})}
+    return [(title, key) for title, (key, plain) in told.items() if {record[key] for record in records} - plain]
 
 
 def _mean(values: list[float | None], method: str, key: str) -> float | None:
@@ -205,11 +230,13 @@ def _mean(values: list[float | None], method: str, key: str) -> float | None:
     return None if any(value is None for value in values) else math.fsum(values) / len(values)
 
 
-def _owner(entry: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, Any]:
-    found = [r for r in records if r["method"] == entry["method"] and entry.get("top_p", r["top_p"]) == r["top_p"]]
+def _owner(entry: Mapping[str, Any], records: list[dict[str, Any]]) -> dict[str, Any]:
+    names = ("method", "top_p", "temperature")
+    found = [record for record in records if all(entry.get(name, record[name]) == record[name] for name in names)]
     if len(found) != 1:
         raise ValueError(
-            f"the paired difference of {entry['method']!r} (top_p {entry.get('top_p')}) fits {len(found)} of the "
-            "table's rows; it must name the method, and the top_p where the method has several."
+            f"the paired difference of {entry['method']!r} (top_p {entry.get('top_p')}, temperature "
+            f"{entry.get('temperature')}) fits {len(found)} of the table's rows; it must name the method, and the "
+            "decoding where the method has several."
         )
     return found[0]

@@ -1,0 +1,275 @@
+"""What one experiment found: its JSON, read and checked, so that a page is written from numbers that fit together."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dpa.report.table import REFERENCE, summarise
+
+Decoding = tuple[float, float]
+"""Top-p and temperature."""
+NUMBER = (int, float)
+ROW = {"method": str, "seed": int, "top_p": NUMBER, "temperature": NUMBER, "file": str, "n_scenes": int}
+"""What identifies a row; every other entry is a figure: a number, or None where it was not measured."""
+PAIRED = {
+    "method": str, "top_p": NUMBER, "temperature": NUMBER, "against_top_p": NUMBER, "against_temperature": NUMBER,
+    "realism_difference": NUMBER, "ci95": list, "over": str, "n_seeds": int,
+}  # fmt: skip
+LIKELIHOOD = {"method": str, "seed": int, "file": str}
+SPLITS = ("train", "tune", "eval")
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Methods beside the reference, each at one decoding.
+
+    Attributes:
+        rows: one for each method, decoding and seed; see :data:`ROW`.
+        paired: realism of a method minus that of the reference, scene by scene; see :data:`PAIRED`.
+    """
+
+    rows: Sequence[Mapping[str, Any]]
+    paired: Sequence[Mapping[str, Any]]
+
+    def records(self) -> list[dict[str, Any]]:
+        """One record for each method and decoding: means over seeds; see :func:`~dpa.report.table.summarise`."""
+        return summarise(self.rows, self.paired)
+
+    def entry(self, method: str) -> Mapping[str, Any] | None:
+        """The paired difference of a method, or None."""
+        return next((entry for entry in self.paired if entry["method"] == method), None)
+
+    def of(self, method: str, decoding: Decoding) -> list[Mapping[str, Any]]:
+        """Rows of a method at a decoding, in order of seeds."""
+        found = [row for row in self.rows if row["method"] == method and decoding_of(row) == decoding]
+        return sorted(found, key=lambda row: row["seed"])
+
+
+@dataclass(frozen=True)
+class Axis:
+    """What the methods of a scaling experiment differ in.
+
+    Attributes:
+        name: what stands on the axis.
+        values: place of each method on it.
+        log: the axis is logarithmic.
+    """
+
+    name: str
+    values: Mapping[str, float]
+    log: bool
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """The content of ``experiments/<name>.json``.
+
+    Attributes:
+        path: the file.
+        name: of the experiment; that of its configuration.
+        title: for people.
+        paper: what it repeats of the paper, or what it adds.
+        question: that it answers.
+        metric: configuration of the realism metric.
+        scenes: number of scenes of each split, and ``source``.
+        seeds: of the training runs.
+        methods: in the order of tables.
+        labels: what the methods are called.
+        published: the paper's figures of a method, where it has some.
+        headline: method whose difference is the result; fixed before the numbers are known.
+        common: decoding of ``at_common``.
+        chosen: each method's best decoding on the tuning scenes.
+        at_common: all methods at the common decoding, the reference also at the others of the grid.
+        own_best: each method at its chosen decoding, against the reference at its own.
+        tuning: rows of every method at every decoding of the grid, on the tuning scenes.
+        likelihood: rows ``{"method", "seed", "file"}`` and figures of likelihood, on the evaluation scenes.
+        axis: of a scaling experiment.
+        curves: run folders by method and seed, relative to the folder of the study.
+        stages: seconds of each.
+        wall_seconds: of all.
+        config: of the run.
+        versions: of packages.
+        machine: it ran on.
+        date: it was finished.
+        command: that makes it.
+    """
+
+    path: Path
+    name: str
+    title: str
+    paper: str
+    question: str
+    metric: str
+    scenes: Mapping[str, Any]
+    seeds: Sequence[int]
+    methods: Sequence[str]
+    labels: Mapping[str, str]
+    published: Mapping[str, Mapping[str, float]]
+    headline: str
+    common: Decoding
+    chosen: Mapping[str, Decoding]
+    at_common: Comparison
+    own_best: Comparison
+    tuning: Sequence[Mapping[str, Any]]
+    likelihood: Sequence[Mapping[str, Any]]
+    axis: Axis | None
+    curves: Mapping[str, Mapping[str, str]]
+    stages: Mapping[str, float]
+    wall_seconds: float
+    config: Mapping[str, Any]
+    versions: Mapping[str, str]
+    machine: str
+    date: str
+    command: str
+
+    def label(self, method: str) -> str:
+        """What a method is called; a snapshot ``name@step`` by its method and the step.
+
+        Raises:
+            ValueError: the method has no label.
+        """
+        if method in self.labels:
+            return self.labels[method]
+        base, at, step = method.partition("@")
+        if not at or base not in self.labels:
+            raise ValueError(f"{self.path}: labels has no entry for {method!r}; it has {', '.join(self.labels)}.")
+        return f"{self.labels[base]}, step {step}"
+
+    def grid(self) -> list[Decoding]:
+        """Every decoding that was tried on the tuning scenes."""
+        return sorted({decoding_of(row) for row in self.tuning})
+
+
+def decoding_of(row: Mapping[str, Any]) -> Decoding:
+    """Decoding of a row."""
+    return (float(row["top_p"]), float(row["temperature"]))
+
+
+def in_words(decoding: Decoding) -> str:
+    """A decoding for people.
+
+    Examples:
+        >>> in_words((0.95, 1.0)), in_words((0.9, 0.8))
+        ('top-p 0.95', 'top-p 0.9, temperature 0.8')
+    """
+    top_p, temperature = decoding
+    return f"top-p {top_p:g}" + ("" if temperature == 1 else f", temperature {temperature:g}")
+
+
+def read_json(path: str | Path) -> Any:
+    """Read JSON that holds no NaN.
+
+    Raises:
+        ValueError: the file is no such JSON; the message names it.
+
+    Examples:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp(), "a.json")
+        >>> _ = path.write_text('{"realism": NaN}')
+        >>> read_json(path)
+        Traceback (most recent call last):
+        ...
+        ValueError: .../a.json is no JSON that this page can read (NaN is no number); remove it and make it again.
+    """
+
+    def refuse(name: str) -> None:
+        raise ValueError(f"{name} is no number")
+
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"), parse_constant=refuse)
+    except ValueError as error:
+        raise ValueError(f"{path} is no JSON that this page can read ({error}); remove it and make it again.") from None
+
+
+def read_experiment(path: str | Path) -> Experiment:
+    """Read what an experiment found.
+
+    Args:
+        path: ``experiments/<name>.json`` of a study.
+
+    Raises:
+        ValueError: no JSON, an entry that is missing or of another type, or entries that contradict each other; the
+            message names file and entry.
+    """
+    path = Path(path)
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} holds {type(content).__name__}, not the result of an experiment.")
+    kinds: dict[str, Any] = {
+        "name": str, "title": str, "paper": str, "question": str, "metric": str, "scenes": dict, "seeds": list,
+        "methods": list, "labels": dict, "published": dict, "headline": str, "common": list, "chosen": dict,
+        "rows": list, "paired": list, "own_best": dict, "tuning": list, "likelihood": list, "axis": (dict, type(None)),
+        "curves": dict, "stages": dict, "wall_seconds": NUMBER, "config": dict, "versions": dict, "machine": str,
+        "date": str, "command": str,
+    }  # fmt: skip
+    _check(content, kinds, str(path))
+    _check(content["own_best"], {"rows": list, "paired": list}, f"{path}: own_best")
+    _check(content["scenes"], {**dict.fromkeys(SPLITS, int), "source": str}, f"{path}: scenes")
+    _check_lists(content, path)
+    axis = content["axis"]
+    if axis is not None:
+        _check(axis, {"name": str, "values": dict, "log": bool}, f"{path}: axis")
+    for method, decoding in [("common", content["common"]), *content["chosen"].items()]:
+        if len(decoding) != 2 or not all(isinstance(part, NUMBER) for part in decoding):
+            raise ValueError(f"{path}: the decoding of {method} must be [top_p, temperature], got {decoding!r}.")
+    made = {key: content[key] for key in kinds if key not in ("rows", "paired", "common", "chosen", "own_best", "axis")}
+    experiment = Experiment(
+        path=path,
+        common=_decoding(content["common"]),
+        chosen={method: _decoding(decoding) for method, decoding in content["chosen"].items()},
+        at_common=Comparison(content["rows"], content["paired"]),
+        own_best=Comparison(content["own_best"]["rows"], content["own_best"]["paired"]),
+        axis=None if axis is None else Axis(**axis),
+        **made,
+    )
+    for method in experiment.methods:
+        experiment.label(method)
+    return experiment
+
+
+def _check_lists(content: Mapping[str, Any], path: Path) -> None:
+    """Every entry of the lists is what it must be, and of a method that the experiment has."""
+    own = content["own_best"]
+    lists = (
+        ("rows", content["rows"], ROW), ("tuning", content["tuning"], ROW), ("own_best.rows", own["rows"], ROW),
+        ("paired", content["paired"], PAIRED), ("own_best.paired", own["paired"], PAIRED),
+        ("likelihood", content["likelihood"], LIKELIHOOD),
+    )  # fmt: skip
+    for name, entries, kinds in lists:
+        for place, entry in enumerate(entries):
+            where = f"{path}: {name}[{place}]"
+            _check(entry, kinds, where)
+            if entry["method"] not in content["methods"]:
+                raise ValueError(f"{where} is of {entry['method']!r}, which is none of methods.")
+            figures = {key: value for key, value in entry.items() if key not in {**kinds, "against": str}}
+            for key, value in figures.items():
+                if value is not None and not (isinstance(value, NUMBER) and math.isfinite(value)):
+                    raise ValueError(f"{where}: {key} must be a number or null, got {value!r}.")
+            if "ci95" in kinds and not (len(entry["ci95"]) == 2 and entry["ci95"][0] <= entry["ci95"][1]):
+                raise ValueError(f"{where}: ci95 must be [low, high], got {entry['ci95']!r}.")
+    if content["headline"] not in content["methods"] or REFERENCE not in content["methods"]:
+        raise ValueError(
+            f"{path}: methods must hold {REFERENCE!r} and the headline {content['headline']!r}, got "
+            f"{', '.join(content['methods'])}."
+        )
+
+
+def _check(content: Any, kinds: Mapping[str, Any], where: str) -> None:
+    if not isinstance(content, dict):
+        raise ValueError(f"{where} must be a table of named values, got {content!r}.")
+    missing = [key for key in kinds if key not in content]
+    if missing:
+        raise ValueError(f"{where} has no {', '.join(missing)}; make it again with this version of recipes.compare.")
+    for key, kind in kinds.items():
+        if not isinstance(content[key], kind):
+            names = " or ".join(each.__name__ for each in (kind if isinstance(kind, tuple) else (kind,)))
+            raise ValueError(f"{where}: {key} must be {names}, got {content[key]!r:.80}.")
+
+
+def _decoding(parts: Sequence[float]) -> Decoding:
+    return (float(parts[0]), float(parts[1]))

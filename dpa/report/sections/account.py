@@ -1,0 +1,73 @@
+"""What the numbers cost and what they were learnt from: hours of each stage, data cards of the preferences."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+
+from dpa.preferences.card import DataCard
+from dpa.report.charts import bars, drawn, lines
+from dpa.report.markup import Html, Section, element, folded, hint, joined, table
+from dpa.report.study import Study
+from dpa.report.table import MISSING, duration, number
+
+CARD: Mapping[str, Callable[[DataCard], str]] = {
+    "scenes": lambda card: f"{card.scenes}",
+    "rollouts per scene": lambda card: f"{card.rollouts}",
+    "ranked agents": lambda card: f"{card.agents}",
+    "pairs": lambda card: f"{card.scenes * card.pairs}",
+    "margin of a pair": lambda card: _known(card.margin, 3),
+    "margin over the scene's mean": lambda card: f"{card.relative_margin:.0%}",
+    "pairs without preference": lambda card: f"{card.tied_pairs:.1%}",
+    "Spearman of distance and ADE": lambda card: _known(card.spearman, 2),
+    "a person would take": lambda card: f"{card.human_hours:.1f} h",
+    "on disk, per scene": lambda card: f"{card.scene_bytes / 1000:.1f} kB",
+}
+
+
+def account_section(study: Study) -> Section | None:
+    """Compute account and data cards; None where the study has neither."""
+    parts = [*_stages(study), *_cards(study.cards)]
+    return Section("account", "Compute and preference data", joined(parts)) if parts else None
+
+
+def _stages(study: Study) -> list[Html]:
+    if not study.stages:
+        return []
+    seconds = {name: float(entry["seconds"]) for name, entry in study.stages.items()}
+    jobs = {name: int(entry["jobs"]) for name, entry in study.stages.items()}
+    chart = bars(
+        {name: spent / 3600 for name, spent in seconds.items()},
+        f"Hours of each stage, {duration(sum(seconds.values()))} in all",
+        x="hours",
+        hover=[lines(name, duration(seconds[name]), f"{jobs[name]} jobs") for name in seconds],
+    )
+    rows = [[name, duration(seconds[name]), str(jobs[name])] for name in seconds]
+    rows.append(["all", duration(sum(seconds.values())), str(sum(jobs.values()))])
+    shown = table(["stage", "time", "jobs"], rows)
+    note = hint("Time on the clock while the stage ran, all experiments together (stages.json).")
+    return [element("div", drawn(chart), element("div", shown, note), class_="gallery")]
+
+
+def _cards(cards: Mapping[str, DataCard]) -> list[Html]:
+    if not cards:
+        return []
+    names = [name.replace("/preferences_", ", ").replace("_", " ") for name in cards]
+    rows = [[title, *(cell(card) for card in cards.values())] for title, cell in CARD.items()]
+    shares = list(dict.fromkeys(feature for card in cards.values() for feature in card.feature_shares))
+    rows += [[f"distance made of {feature}", *(_share(card, feature) for card in cards.values())] for feature in shares]
+    origins = [folded(name, element("pre", card.origin.to_json())) for name, card in cards.items()]
+    return [
+        element("h3", "Ranked rollouts of the references"),
+        table(["store", *names], rows),
+        folded("what each store came from", *origins),
+    ]
+
+
+def _share(card: DataCard, feature: str) -> str:
+    share = card.feature_shares.get(feature)
+    return MISSING if share is None else f"{share:.0%}"
+
+
+def _known(value: float, digits: int) -> str:
+    return number(None if math.isnan(value) else value, digits)

@@ -1,0 +1,58 @@
+"""The top of the page: the result, with its intervals and what speaks against it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from dpa.report.experiment import Experiment, decoding_of, in_words
+from dpa.report.findings import headline, reservations
+from dpa.report.markup import Html, element, joined
+from dpa.report.study import FIRST, Study
+from dpa.report.table import signed
+
+
+def claim(study: Study) -> Html:
+    """Headline, both differences in large type, and reservations.
+
+    Args:
+        study: whose ``methods`` experiment the headline is of.
+    """
+    experiment = study.main
+    if experiment is None:
+        sentence = f"No claim: the study has no experiment {FIRST!r}, which compares the methods."
+        return element("p", sentence, class_="headline")
+    compared = sum(len(each.own_best.paired) + len(each.at_common.paired) for each in study.experiments.values())
+    notes = [element("li", note) for note in reservations(experiment, compared)]
+    cards = [
+        _card(experiment, "each at its own best decoding", experiment.own_best.entry(experiment.headline)),
+        _card(experiment, "both at the common decoding", experiment.at_common.entry(experiment.headline)),
+    ]
+    return joined(
+        [
+            element("p", headline(experiment), class_="headline"),
+            element("div", *cards, class_="cards"),
+            element("ul", *notes, class_="reservations"),
+        ]
+    )
+
+
+def _card(experiment: Experiment, title: str, entry: Mapping[str, Any] | None) -> Html:
+    if entry is None:
+        return Html("")
+    low, high = entry["ci95"]
+    kind = "better" if low > 0 else "worse" if high < 0 else "open"
+    against = (float(entry["against_top_p"]), float(entry["against_temperature"]))
+    return element(
+        "div",
+        element("div", title, class_="card-title"),
+        element("div", signed(entry["realism_difference"]), class_=f"figure {kind}"),
+        element("div", f"[{signed(low)}, {signed(high)}] realism, 95 %"),
+        element(
+            "div",
+            f"{experiment.label(experiment.headline)} at {in_words(decoding_of(entry))}, reference at "
+            f"{in_words(against)}; {entry['n_seeds']} seeds",
+            class_="hint",
+        ),
+        class_="card",
+    )

@@ -1,0 +1,169 @@
+"""Likelihood that methods give to ranked rollouts: a table, and curves along training (METHOD figures 4 and 6)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpa.report.charts import Chart, Line, curves, gallery
+from dpa.report.curves import Curve, read_curves
+from dpa.report.experiment import Comparison, Experiment
+from dpa.report.markup import Html, Section, element, folded, hint, joined, sources, table
+from dpa.report.table import REFERENCE, number
+
+FIGURES = {
+    "pair_accuracy": "pair accuracy ↑", "nll_preferred": "NLL preferred", "nll_unpreferred": "NLL unpreferred",
+    "nll_demonstration": "NLL log", "entropy": "entropy", "kl": "KL to reference",
+}  # fmt: skip
+DIGITS = {"pair_accuracy": 3}
+SIDES = {
+    "tune/nll_preferred": ("preferred", "#2a78b5"),
+    "tune/nll_unpreferred": ("unpreferred", "#d55e00"),
+    "tune/nll_demonstration": ("log", "#3c4043"),
+}
+HEALTH = {
+    "train/logit_std": "spread of the preference logits", "train/saturated": "share of saturated pairs",
+    "train/kl": "KL to the reference", "train/entropy": "entropy of the tokens",
+}  # fmt: skip
+POINTS = 120
+"""Most points of a curve on the page; longer ones are averaged over blocks of steps."""
+TABLE_3 = ("dpa_omf", "adversarial_afd")
+"""Methods of the paper's table 3."""
+
+
+def likelihood_table(experiment: Experiment) -> Html:
+    """Likelihood of ranked rollouts of the evaluation scenes, and with it the paper's table 3 where its methods are."""
+    by_method = {
+        method: [row for row in experiment.likelihood if row["method"] == method] for method in experiment.methods
+    }
+    by_method = {method: rows for method, rows in by_method.items() if rows}
+    shown = [key for key in FIGURES if any(row.get(key) is not None for row in experiment.likelihood)]
+    if not shown:
+        return Html("")
+    rows = [
+        [
+            experiment.label(method),
+            *(number(_mean(rows, key), DIGITS.get(key, 2)) for key in shown),
+            sources([row["file"] for row in rows]),
+        ]
+        for method, rows in by_method.items()
+    ]
+    parts = [
+        *([_table_3(experiment, by_method)] if set(TABLE_3) <= set(by_method) else []),
+        element("h3", "Likelihood of ranked rollouts"),
+        table(["method", *(FIGURES[key] for key in shown), "seeds"], rows),
+        hint(
+            "On the reference's ranked rollouts of the evaluation scenes, means over seeds. Pair accuracy: how often the "
+            "nearer rollout of a pair is the likelier one. NLL: negative log-likelihood."
+        ),
+    ]
+    return joined(parts)
+
+
+def _table_3(experiment: Experiment, by_method: Mapping[str, Sequence[Mapping[str, Any]]]) -> Html:
+    rows = []
+    for method in TABLE_3:
+        published = experiment.published.get(method, {})
+        found = Comparison(experiment.at_common.of(method, experiment.common), []).records()
+        values = {"pair_accuracy": _mean(by_method[method], "pair_accuracy")}
+        values |= {key: found[0][key] if found else None for key in ("realism", "min_ade")}
+        cells = [
+            joined([number(value, 3), *([element("small", number(published[key], 3))] if key in published else [])], "")
+            for key, value in values.items()
+        ]
+        rows.append([experiment.label(method), *cells])
+    return joined(
+        [
+            element("h3", "Who learns the ranking (table 3)"),
+            table(["method", "pair accuracy ↑", "realism ↑", "minADE ↓"], rows),
+            hint("Realism and minADE at the common decoding; in grey the paper's numbers."),
+        ]
+    )
+
+
+def training_section(
+    experiments: Sequence[Experiment], folder: Path, colours: Mapping[str, Mapping[str, str]]
+) -> Section | None:
+    """Curves of every experiment along its alignment; None where no run has any.
+
+    Args:
+        experiments: of the study.
+        folder: of the study.
+        colours: of the methods, by experiment.
+    """
+    parts = []
+    for experiment in experiments:
+        runs = {
+            method: [read_curves(folder / run) for run in seeds.values() if (folder / run / "scalars").is_dir()]
+            for method, seeds in experiment.curves.items()
+        }
+        runs = {method: seeds for method, seeds in runs.items() if seeds}
+        charts = [chart for method, seeds in runs.items() for chart in _likelihood(experiment.label(method), seeds)]
+        health = [chart for key in HEALTH for chart in _health(experiment, runs, key, colours[experiment.name])]
+        if charts or health:
+            body = joined([gallery(charts, small=True), element("h3", "Health of the alignment"), gallery(health)])
+            parts.append(folded(experiment.title, body, open_=not parts))
+    if not parts:
+        return None
+    about = hint(
+        "Figures 4 and 6 of the paper: negative log-likelihood of ranked rollouts of the tuning scenes along training. Thin "
+        f"lines are seeds, thick ones their mean; curves of more than {POINTS} points are averaged over blocks of steps. "
+        "Each figure has a scale of its own."
+    )
+    return Section("training", "Likelihood along training", joined([about, *parts]))
+
+
+def _likelihood(label: str, seeds: Sequence[Mapping[str, Curve]]) -> list[Chart]:
+    content = [line for key, (name, colour) in SIDES.items() for line in _lines(name, key, seeds, colour)]
+    return [curves(content, label, x="step", y="negative log-likelihood", height=250)] if content else []
+
+
+def _health(
+    experiment: Experiment, runs: Mapping[str, Sequence[Mapping[str, Curve]]], key: str, colours: Mapping[str, str]
+) -> list[Chart]:
+    content = [
+        line
+        for method, seeds in runs.items()
+        if method != REFERENCE
+        for line in _lines(experiment.label(method), key, seeds, colours[method])
+    ]
+    return [curves(content, HEALTH[key], x="step", y=key, height=260)] if content else []
+
+
+def _lines(name: str, key: str, seeds: Sequence[Mapping[str, Curve]], colour: str) -> list[Line]:
+    """A thin line for each seed and a thick one for their mean, where a run has the scalar."""
+    found = [blocks(run[key], POINTS) for run in seeds if key in run]
+    if not found:
+        return []
+    if len(found) == 1 or any(step != found[0][0] for step, _ in found):  # runs of other lengths have no mean
+        return [Line(name, *each, colour, legend=place == 0, markers=3) for place, each in enumerate(found)]
+    mean = [float(value) for value in np.mean([value for _, value in found], axis=0)]
+    thin = [Line(name, *each, colour, width=1, opacity=0.35, legend=False) for each in found]
+    return [*thin, Line(name, found[0][0], mean, colour, width=2.6)]
+
+
+def blocks(curve: Curve, points: int) -> tuple[list[float], list[float]]:
+    """A curve in at most so many points, each the mean of a block of steps.
+
+    Args:
+        curve: with finite values.
+        points: at most.
+
+    Examples:
+        >>> blocks({"step": [1, 2, 3, 4], "value": [1.0, 3.0, 5.0, 7.0]}, 2)
+        ([1.5, 3.5], [2.0, 6.0])
+    """
+    known = [(s, v) for s, v in zip(curve["step"], curve["value"], strict=True) if math.isfinite(v)]
+    size = math.ceil(len(known) / points) or 1
+    parts = [known[first : first + size] for first in range(0, len(known), size)]
+    means = [tuple(sum(column) / len(part) for column in zip(*part, strict=True)) for part in parts]
+    return [step for step, _ in means], [value for _, value in means]
+
+
+def _mean(rows: Sequence[Mapping[str, Any]], key: str) -> float | None:
+    values = [row.get(key) for row in rows]
+    return None if None in values else sum(values) / len(values)

@@ -1,0 +1,113 @@
+"""The folder of a study, read for its page: experiments, stages, data cards, studies of rankings, scenes to play."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dpa.preferences import PreferenceStore
+from dpa.preferences.card import DataCard, data_card
+from dpa.report.experiment import Experiment, read_experiment, read_json
+
+STUDIES = ("validity", "sensitivity", "discriminator")
+"""Folders of a study that a recipe of their own fills."""
+FIRST = "methods"
+"""Experiment that the headline is of, and that stands first."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """What a folder of results holds; a part that it lacks is None or empty.
+
+    Attributes:
+        folder: of the study.
+        experiments: by name, ``methods`` first.
+        stages: seconds and jobs of each stage.
+        players: packed scenes and rollouts, see :func:`dpa.report.player.pack_players`.
+        summaries: ``summary.json`` of each of :data:`STUDIES`.
+        pictures: PNGs of each of :data:`STUDIES`.
+        cards: data card of each store of preferences, by its folder relative to the study's.
+    """
+
+    folder: Path
+    experiments: Mapping[str, Experiment]
+    stages: Mapping[str, Mapping[str, float]]
+    players: Mapping[str, Any] | None
+    summaries: Mapping[str, Mapping[str, Any]]
+    pictures: Mapping[str, list[Path]]
+    cards: Mapping[str, DataCard]
+
+    @property
+    def main(self) -> Experiment | None:
+        """The experiment that the headline is of."""
+        return self.experiments.get(FIRST)
+
+
+def read_study(folder: str | Path) -> Study:
+    """Read a folder of results.
+
+    Args:
+        folder: RUNS of ``recipes.compare``.
+
+    Raises:
+        ValueError: no such folder, nothing in it that a page could show, or a file that cannot be read; the message
+            names it.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise ValueError(f"{folder} is no folder; name the one that recipes.compare wrote (its output=...).")
+    paths = sorted((folder / "experiments").glob("*.json"), key=lambda path: (path.stem != FIRST, path.stem))
+    summaries = {name: folder / name / "summary.json" for name in STUDIES}
+    summaries = {name: read_json(path) for name, path in summaries.items() if path.is_file()}
+    if not paths and not summaries:
+        raise ValueError(
+            f"{folder} holds no results: neither experiments/*.json nor {', '.join(STUDIES)} with a summary.json; run "
+            f"python -m recipes.compare experiment={FIRST} output={folder} first."
+        )
+    stages, players = folder / "stages.json", folder / "players.json"
+    return Study(
+        folder=folder,
+        experiments={path.stem: read_experiment(path) for path in paths},
+        stages=read_json(stages) if stages.is_file() else {},
+        players=read_json(players) if players.is_file() else None,
+        summaries=summaries,
+        pictures={name: sorted((folder / name).glob("*.png")) for name in STUDIES},
+        cards=_cards(folder),
+    )
+
+
+def _cards(folder: Path) -> dict[str, DataCard]:
+    found = {}
+    for path in sorted(folder.glob("seed_*/preferences_*/metadata.json")):
+        store = PreferenceStore(path.parent)
+        if len(store):
+            found[path.parent.relative_to(folder).as_posix()] = data_card(store)
+    return found
+
+
+class Evaluations:
+    """Figures of every scene, from the files behind the rows; each file is read once.
+
+    Args:
+        folder: of the study.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+        self._read: dict[str, dict[str, list[float | None]] | None] = {}
+
+    def __call__(self, file: str) -> Mapping[str, list[float | None]] | None:
+        """Values of each scene by figure; None if the file is not in the folder.
+
+        Raises:
+            ValueError: the file is no result of an evaluation.
+        """
+        if file not in self._read:
+            path = self.folder / file
+            content = read_json(path) if path.is_file() else {"per_scene": None}
+            if not isinstance(content, dict) or "per_scene" not in content:
+                raise ValueError(f"{path} has no 'per_scene'; it is no result of an evaluation.")
+            self._read[file] = content["per_scene"]
+        return self._read[file]

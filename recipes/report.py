@@ -1,0 +1,65 @@
+"""One page from everything that a study has found, to put beside a paper.
+
+    python -m recipes.report RUNS OUT
+
+RUNS is the folder that recipes.compare fills (its output). OUT is the page: a .html file, or a folder for index.html. With a
+.png it is one picture, the differences of the first experiment. Nothing is computed that the files in RUNS do not hold.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from dpa.report.figures import plot_comparison
+from dpa.report.page import write_study
+from dpa.report.study import read_study
+from recipes.cli import refused
+
+EXPERIMENTS = Path(__file__).parent / "config" / "experiment"
+"""One YAML for each experiment that recipes.compare knows."""
+
+
+def report(runs: Path, out: Path) -> Path:
+    """Write the page of a study, or the picture of its first experiment.
+
+    Args:
+        runs: folder of results.
+        out: ``.html``, a folder for ``index.html``, or ``.png``.
+
+    Returns:
+        The file that was written.
+
+    Raises:
+        ValueError: no results in ``runs``, or a file of it that cannot be read; the message names it.
+    """
+    study = read_study(runs)
+    if out.suffix == ".png":
+        plot_comparison(next(iter(study.experiments.values())), out)
+        return out
+    page = out if out.suffix == ".html" else out / "index.html"
+    return write_study(page, study, experiments=sorted(path.stem for path in EXPERIMENTS.glob("*.yaml")))
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Arguments of the command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m recipes.report", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("runs", metavar="RUNS", type=Path, help="folder of results")
+    parser.add_argument("out", metavar="OUT", type=Path, help="page.html, a folder, or picture.png")
+    return parser
+
+
+def main() -> None:
+    """Entry point of ``python -m recipes.report``."""
+    given = make_parser().parse_args()
+    try:
+        print(report(given.runs, given.out))
+    except (ValueError, OSError) as error:
+        sys.exit(refused(error))
+
+
+if __name__ == "__main__":
+    main()
