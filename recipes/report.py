@@ -2,8 +2,8 @@
 
     python -m recipes.report RUNS OUT
 
-RUNS is the folder that recipes.compare fills (its output). OUT is the page: a .html file, or a folder for index.html. With a
-.png it is one picture, the differences of the first experiment. Nothing is computed that the files in RUNS do not hold.
+RUNS is the folder that recipes.compare fills (its output). OUT is the page: a .html file, or a folder for index.html.
+With a .png it is one picture, the differences of the first experiment. The numbers are those of the files in RUNS.
 """
 
 from __future__ import annotations

@@ -26,10 +26,10 @@ from dpa.ranking import Distance
 from dpa.ranking.agreement import rank_correlation, same_order
 from dpa.report.statistics import Interval, summary
 from dpa.report.studies import plot_sensitivity
-from recipes.cli import CONFIG, plain, recipe, write_json
+from recipes.cli import CONFIG, recipe, write_json
 from recipes.rolled import Rolled
 from recipes.scenes import open_splits
-from recipes.study import as_json, distances_of, over_scenes, shown, study
+from recipes.study import as_json, distances_of, how_made, over_scenes, shown, study
 
 ADE = "ade"
 MARGINS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, np.inf)
@@ -191,11 +191,13 @@ def main(cfg: DictConfig) -> None:
         raise ValueError(f"baseline must be one of the rankings {', '.join(distances)}, got {cfg.baseline!r}.")
     scenes = open_splits(cfg.scenes)[cfg.split]
     decided_by = {"rankings": {name: distance.describe() for name, distance in distances.items()}}
-    variants = Variants(study(cfg, scenes, lambda each: measure_scene(each, distances), decided_by), cfg.baseline)
+    measured = study(cfg, scenes, lambda each: measure_scene(each, distances), decided_by)
+    variants = Variants(measured, cfg.baseline)
     found, folder = summarise(variants), Path(cfg.output)
     agreement = {name: values["correlation"] for name, values in found["variants"].items()}
     plot_sensitivity(agreement, list(found["margins"].items()), folder / "sensitivity.png")
-    write_json(folder / "summary.json", as_json(found) | {"seconds": variants.seconds, "options": plain(cfg.rankings)})
+    made = how_made(cfg, "sensitivity", scenes, measured)
+    write_json(folder / "summary.json", as_json(found) | {"seconds": variants.seconds, "made": made})
     _print(found, variants, len(scenes))
     print(f"numbers of every scene, summary and figure: {folder}")
 

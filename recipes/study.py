@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -106,6 +108,24 @@ def distances_of(section: DictConfig, name: str) -> dict[str, Distance]:
         ValueError: a wrong option; the message names it.
     """
     return {key: build_distance(options, f"{name}.{key}") for key, options in section.items()}
+
+
+def how_made(cfg: DictConfig, recipe: str, scenes: SceneStore, measured: dict[str, list[dict]]) -> dict[str, Any]:
+    """What a reader of a study needs to make it again: command, sizes and configuration.
+
+    Args:
+        cfg: of the study.
+        recipe: its name.
+        scenes: that were rolled out.
+        measured: what :func:`study` gave.
+    """
+    return {
+        "command": shlex.join(["python", "-m", f"recipes.{recipe}", *sys.argv[1:]]),
+        "scenes": len(scenes),
+        "policies": list(measured),
+        "num_rollouts": cfg.num_rollouts,
+        "config": plain(cfg),
+    }
 
 
 def over_scenes(values: np.ndarray, name: str) -> Interval:

@@ -29,7 +29,7 @@ from envs.seeding import make_generator
 from recipes.cli import CONFIG, finite, plain, recipe, write_json
 from recipes.rolled import Rolled
 from recipes.scenes import open_splits
-from recipes.study import as_json, distances_of, over_scenes, shown, study
+from recipes.study import as_json, distances_of, how_made, over_scenes, shown, study
 
 FIGURES = ("realism", "kinematic", "interactive", "map_based")
 RANDOM_GROUPS = 8
@@ -174,9 +174,9 @@ def main(cfg: DictConfig) -> None:
     found, paired = summarise(measured), compare_with(measured, cfg.against)
     folder = Path(cfg.output)
     plot_validity(found, folder / "validity.png")
-    write_json(
-        folder / "summary.json", {"rankings": as_json(found), "minus": cfg.against, "differences": as_json(paired)}
-    )
+    made = how_made(cfg, "validity", scenes, measured)
+    content = {"rankings": as_json(found), "minus": cfg.against, "differences": as_json(paired), "made": made}
+    write_json(folder / "summary.json", content)
     _print(found, paired, len(scenes), len(measured), cfg)
     print(f"numbers of every scene, summary and figure: {folder}")
 

@@ -153,17 +153,26 @@ def forest(
                 y=[value for y, _ in ends for value in (y, y, None)],
                 mode="lines", line={"color": shade, "width": 2.5}, hoverinfo="skip", showlegend=False, legendgroup=kind,
             )  # fmt: skip
-        shades = list(colour.values())
-        hollow = {"color": "white", "line": {"color": shades, "width": 2}}
-        full = {"color": shades, "line": {"color": "white", "width": 1}}
+        hovers = [lines(f"{name}, {kind}") + "<br>" + each.text for name, each in values.items()]
         figure.add_scatter(
             x=[each.mean for each in values.values()], y=list(at.values()), mode="markers", name=kind, legendgroup=kind,
-            marker={"size": 10, **(hollow if place and colours is None else full)},
-            hovertext=[lines(f"{name}, {kind}") + "<br>" + each.text for name, each in values.items()], hoverinfo="text",
+            marker=_dot(list(colour.values()), hollow=bool(place) and colours is None), showlegend=False,
+            hovertext=hovers, hoverinfo="text",
         )  # fmt: skip
+        # The legend tells kinds apart; a colour that means better or worse is not theirs.
+        shade = NEUTRAL if colours is None else colours[kind]
+        figure.add_scatter(
+            x=[None], y=[None], mode="markers", name=kind, legendgroup=kind,
+            marker=_dot(shade, hollow=bool(place) and colours is None),
+        )  # fmt: skip
+    ends = [end for values in groups.values() for each in values.values() for end in (each.low, each.high)]
+    room = 0.06 * (max(ends) - min(ends)) or 1.0
     figure.update_layout(
         _layout(len(groups)),
-        xaxis={**_axis(x), "zeroline": True, "zerolinecolor": QUIET, "zerolinewidth": 1},
+        xaxis={
+            **_axis(x), "zeroline": True, "zerolinecolor": QUIET, "zerolinewidth": 1,
+            "range": [min(ends) - room, max(ends) + room],
+        },
         yaxis={
             "tickvals": list(range(len(rows))), "ticktext": [escape(row, quote=False) for row in rows],
             "range": [len(rows) - 0.5, -0.5], "showgrid": False, "zeroline": False, "automargin": True,
@@ -173,6 +182,12 @@ def forest(
     )  # fmt: skip
     height = max(ROW_HEIGHT, 13 * len(groups) + 12)
     return Chart(figure, title, caption, 90 + height * max(len(rows), 2) + LEGEND_HEIGHT * math.ceil(len(groups) / 3))
+
+
+def _dot(colour: str | list[str], *, hollow: bool) -> dict[str, Any]:
+    if hollow:
+        return {"size": 10, "color": "white", "line": {"color": colour, "width": 2}}
+    return {"size": 10, "color": colour, "line": {"color": "white", "width": 1}}
 
 
 def curves(
@@ -197,13 +212,16 @@ def curves(
             low, high = line.band
             figure.add_scatter(
                 x=[*line.x, *reversed(line.x)], y=[*high, *reversed(low)], fill="toself", fillcolor=line.colour,
-                opacity=0.15, line={"width": 0}, hoverinfo="skip", showlegend=False, mode="lines", legendgroup=line.name,
+                opacity=0.15, line={"width": 0}, hoverinfo="skip", showlegend=False, mode="lines",
+                legendgroup=line.name,
             )  # fmt: skip
         figure.add_scatter(**_trace(line))
     named = sum(line.legend for line in content)
+    # On a logarithmic axis every place that was measured has its tick: powers of ten are few and far between.
+    places = {"type": "log", "tickvals": sorted({at for line in content for at in line.x}), "tickformat": "~g"}
     figure.update_layout(
         _layout(named),
-        xaxis={**_axis(x), **({"type": "log"} if log_x else {})},
+        xaxis={**_axis(x), **(places if log_x else {})},
         yaxis={**_axis(y), "zeroline": zero, "zerolinecolor": QUIET, "zerolinewidth": 1},
         hovermode="closest",
     )
@@ -256,7 +274,7 @@ def heat(
     """A matrix of numbers, coloured from ``low`` to ``high``."""
     figure = go.Figure(
         go.Heatmap(
-            z=[list(row) for row in values], x=list(columns), y=list(rows), zmin=low, zmax=high, showscale=False,
+            z=[list(row) for row in values], x=[_broken(column) for column in columns], y=list(rows), zmin=low, zmax=high, showscale=False,
             colorscale=[[0, "#ffffff"], [1, "#6fa8d6"]], xgap=2, ygap=2, hovertext=[list(row) for row in hover],
             hoverinfo="text", text=[[f"{value:.2f}" for value in row] for row in values], texttemplate="%{text}",
             textfont={"size": 11, "color": INK},
@@ -264,10 +282,15 @@ def heat(
     )  # fmt: skip
     figure.update_layout(
         _layout(1),
-        xaxis={**_axis(x), "showgrid": False, "type": "category", "fixedrange": True},
+        xaxis={**_axis(x), "showgrid": False, "type": "category", "fixedrange": True, "tickangle": 0},
         yaxis={"autorange": "reversed", "automargin": True, "fixedrange": True, "showgrid": False, "type": "category"},
     )
     return Chart(figure, title, caption, 90 + 24 * len(rows))
+
+
+def _broken(title: str) -> str:
+    """A title in two lines, so that many stand side by side on a phone."""
+    return escape(title, quote=False).replace(" ", "<br>", 1)
 
 
 def drawn(chart: Chart) -> Html:
@@ -300,7 +323,8 @@ def _layout(named: int) -> dict[str, Any]:
         "paper_bgcolor": "white",
         "plot_bgcolor": "white",
         "showlegend": named > 1,
-        "legend": {"orientation": "h", "x": 0, "xanchor": "left", "y": 0, "yanchor": "bottom", "yref": "container"},
+        "legend": {"orientation": "h", "x": 0, "xanchor": "left", "xref": "container", "y": 0, "yanchor": "bottom",
+                   "yref": "container"},
         "hoverlabel": {"bgcolor": "white", "bordercolor": RULE, "font": {"family": FONT, "size": 12, "color": INK},
                        "align": "left"},
     }  # fmt: skip

@@ -50,8 +50,8 @@ def write_study(
     sections = list(_sections(study, experiments))
     index = [element("a", section.title, href=f"#{section.name}") for section in sections]
     shown = [
-        element("section", element("h2", title) if headed else "", body, id=name)
-        for name, title, body, headed in sections
+        element("section", element("h2", heading) if headed else "", body, id=name)
+        for name, heading, body, headed in sections
     ]
     body = joined(
         [

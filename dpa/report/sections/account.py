@@ -17,8 +17,8 @@ CARD: Mapping[str, Callable[[DataCard], str]] = {
     "ranked agents": lambda card: f"{card.agents}",
     "pairs": lambda card: f"{card.scenes * card.pairs}",
     "margin of a pair": lambda card: _known(card.margin, 3),
-    "margin over the scene's mean": lambda card: f"{card.relative_margin:.0%}",
-    "pairs without preference": lambda card: f"{card.tied_pairs:.1%}",
+    "margin over the scene's mean": lambda card: _percent(card.relative_margin),
+    "pairs without preference": lambda card: _percent(card.tied_pairs),
     "Spearman of distance and ADE": lambda card: _known(card.spearman, 2),
     "a person would take": lambda card: f"{card.human_hours:.1f} h",
     "on disk, per scene": lambda card: f"{card.scene_bytes / 1000:.1f} kB",
@@ -66,8 +66,12 @@ def _cards(cards: Mapping[str, DataCard]) -> list[Html]:
 
 def _share(card: DataCard, feature: str) -> str:
     share = card.feature_shares.get(feature)
-    return MISSING if share is None else f"{share:.0%}"
+    return MISSING if share is None else _percent(share)
 
 
 def _known(value: float, digits: int) -> str:
     return number(None if math.isnan(value) else value, digits)
+
+
+def _percent(share: float) -> str:
+    return _known(100 * share, 0) + " %"

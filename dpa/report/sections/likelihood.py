@@ -29,7 +29,7 @@ HEALTH = {
     "train/logit_std": "spread of the preference logits", "train/saturated": "share of saturated pairs",
     "train/kl": "KL to the reference", "train/entropy": "entropy of the tokens",
 }  # fmt: skip
-POINTS = 120
+POINTS = 40
 """Most points of a curve on the page; longer ones are averaged over blocks of steps."""
 TABLE_3 = ("dpa_omf", "adversarial_afd")
 """Methods of the paper's table 3."""
@@ -44,21 +44,17 @@ def likelihood_table(experiment: Experiment) -> Html:
     shown = [key for key in FIGURES if any(row.get(key) is not None for row in experiment.likelihood)]
     if not shown:
         return Html("")
-    rows = [
-        [
-            experiment.label(method),
-            *(number(_mean(rows, key), DIGITS.get(key, 2)) for key in shown),
-            sources([row["file"] for row in rows]),
-        ]
-        for method, rows in by_method.items()
-    ]
+    rows = []
+    for method, of_method in by_method.items():
+        means = [number(_mean(of_method, key), DIGITS.get(key, 2)) for key in shown]
+        rows.append([experiment.label(method), *means, sources([row["file"] for row in of_method])])
     parts = [
         *([_table_3(experiment, by_method)] if set(TABLE_3) <= set(by_method) else []),
         element("h3", "Likelihood of ranked rollouts"),
         table(["method", *(FIGURES[key] for key in shown), "seeds"], rows),
         hint(
-            "On the reference's ranked rollouts of the evaluation scenes, means over seeds. Pair accuracy: how often the "
-            "nearer rollout of a pair is the likelier one. NLL: negative log-likelihood."
+            "On the reference's ranked rollouts of the evaluation scenes, means over seeds. Pair accuracy: how often "
+            "the nearer rollout of a pair is the likelier one. NLL: negative log-likelihood."
         ),
     ]
     return joined(parts)
@@ -110,8 +106,9 @@ def training_section(
     if not parts:
         return None
     about = hint(
-        "Figures 4 and 6 of the paper: negative log-likelihood of ranked rollouts of the tuning scenes along training. Thin "
-        f"lines are seeds, thick ones their mean; curves of more than {POINTS} points are averaged over blocks of steps. "
+        "Figures 4 and 6 of the paper: negative log-likelihood of ranked rollouts of the tuning scenes along training. "
+        f"Thin lines are seeds, thick ones their mean; curves of more than {POINTS} points are averaged over blocks of "
+        "steps. "
         "Each figure has a scale of its own."
     )
     return Section("training", "Likelihood along training", joined([about, *parts]))

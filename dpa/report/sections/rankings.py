@@ -1,4 +1,4 @@
-"""Studies of rankings: does a distance tell realism (METHOD figure 3), what its options change, and a rival (figure 10)."""
+"""Studies of rankings: a distance and realism (METHOD figure 3), its options, and a discriminator (figure 10)."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def sensitivity_section(found: Mapping[str, Any]) -> Section:
         ),
         curves(
             pairs, "Pairs of the nearest and farthest quarter", x="rollouts of a scene", y="share", log_x=True,
-            caption="With more rollouts the quarters lie farther apart.",
+            caption="What these pairs are like when a scene has fewer rollouts.",
         ),
     ]  # fmt: skip
     columns = {"correlation": "Spearman", "overlap": "same nearest quarter", "turned": "pairs turned round"}
@@ -159,8 +159,8 @@ def discriminator_section(found: Mapping[str, Any]) -> Section:
     }
     charts = [
         forest(
-            groups, "Rank correlation of a score with what a rollout does", x="Spearman, 95 % intervals", colours=shades,
-            caption="Within a scene; below 0 the ranking prefers less of it.",
+            groups, "Rank correlation of a score with what a rollout does", x="Spearman, 95 % intervals",
+            caption="Within a scene; below 0 the ranking prefers less of it.", colours=shades,
         ),
         forest(
             quarters, "Realism of the rollouts that a ranking prefers", x="realism minus that of random rollouts",

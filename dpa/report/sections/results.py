@@ -67,8 +67,8 @@ def experiment_section(experiment: Experiment, colours: Mapping[str, str], evalu
 def differences(experiment: Experiment) -> Chart | None:
     """Forest of paired differences at both decodings; None where nothing was compared."""
     groups = {
-        "own best decoding": _differences(experiment, experiment.own_best, experiment.chosen.get(REFERENCE)),
-        "common decoding": _differences(experiment, experiment.at_common, experiment.common),
+        "own best": _differences(experiment, experiment.own_best, experiment.chosen.get(REFERENCE)),
+        "common": _differences(experiment, experiment.at_common, experiment.common),
     }
     groups = {kind: found for kind, found in groups.items() if found}
     if not groups:
@@ -107,6 +107,7 @@ def matched_curves(experiment: Experiment, colours: Mapping[str, str]) -> list[C
                 ],
                 dash="dot" if method == REFERENCE else "solid",
                 markers=[15 if decoding_of(record) == chosen else 6 for record in known],
+                opacity=0.45 if "@" in method else 1.0,
             )
         )
     if not any(len(line.x) > 1 for line in content):
@@ -127,13 +128,8 @@ def _panel(experiment: Experiment, comparison: Comparison, evaluations: Evaluati
 def _main_table(experiment: Experiment, comparison: Comparison) -> Html:
     records = _ordered(experiment, comparison)
     columns = [column for column in COLUMNS if column.key in MAIN]
-    head = [
-        "method",
-        "decoding",
-        *(f"{column.title} {column.better}" for column in columns),
-        "Δ realism [95 %]",
-        "seeds",
-    ]
+    head = ["method", "decoding", *(f"{column.title}\N{NO-BREAK SPACE}{column.better}" for column in columns)]
+    head += [DIFFERENCE_TITLE, "seeds"]
     rows, shown = [], set()
     for record in records:
         method = record["method"]

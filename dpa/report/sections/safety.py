@@ -47,8 +47,8 @@ def safety_table(experiment: Experiment, comparison: Comparison, evaluations: Ev
             element("h3", "Safety"),
             table(["method", *(f"{SAFETY[key]}\N{NO-BREAK SPACE}↓" for key in measured)], rows),
             hint(
-                "Means over seeds and scenes. Below each its difference from the reference, with a 95 % interval over the "
-                "scenes where all have a value; bold where the interval does not contain 0."
+                "Means over seeds and scenes. Below each its difference from the reference, with a 95 % interval over "
+                "the scenes where all have a value; bold where the interval does not contain 0."
             ),
         ]
     )

@@ -1,4 +1,4 @@
-"""A small study with everything that a real one has. Its numbers are made up: they are a test's, and of nothing else."""
+"""A small study with everything that a real one has. Its numbers are made up for tests."""
 
 from __future__ import annotations
 
@@ -81,7 +81,8 @@ def write_experiment(
         },
         "tuning": [row(folder, m, s, d, split="tune") for m in methods for d in GRID for s in SEEDS],
         "likelihood": [likelihood(method, seed) for method in methods for seed in SEEDS],
-        "axis": axis, "curves": {m: {str(seed): curves(folder, m, seed) for seed in SEEDS} for m in others if "@" not in m},
+        "axis": axis,
+        "curves": {m: {str(seed): curves(folder, m, seed) for seed in SEEDS} for m in others if "@" not in m},
         "stages": {"pretrain": 5400.0, "align": 125.0}, "wall_seconds": 5525.0, "config": {"mark": "<!--{title}-->"},
         "versions": {"torch": "2.13.0"}, "machine": "Linux x86_64, 2 CPU cores", "date": "2026-11-21",
         "command": f"python -m recipes.compare experiment={name} 'name=<b>'",
@@ -96,8 +97,10 @@ def values(method: str, seed: int, decoding: tuple[float, float]) -> dict[str, l
     base = method.partition("@")[0]
     gain = GAIN[base] * (float(method.partition("@")[2] or 60) / 60) + 0.05 * (0.95 - decoding[0])
     scene = np.linspace(-0.1, 0.1, SCENES)
-    level = {"realism": 0.6 + gain, "kinematic": 0.4 + gain, "interactive": 0.7 + gain, "map_based": 0.8 + gain,
-             "min_ade": 1.4 - gain, "spread": 2.0 * decoding[0] * decoding[1] - gain, "preference_distance": 5.0}  # fmt: skip
+    level = {
+        "realism": 0.6 + gain, "kinematic": 0.4 + gain, "interactive": 0.7 + gain, "map_based": 0.8 + gain,
+        "min_ade": 1.4 - gain, "spread": 2.0 * decoding[0] * decoding[1] - gain, "preference_distance": 5.0,
+    }  # fmt: skip
     found = {}
     for figure in FIGURES:
         found[figure] = (level.get(figure, 0.2 - gain) + scene + draw.normal(0, 0.01, SCENES)).round(6).tolist()
@@ -149,8 +152,10 @@ def curves(folder: Path, method: str, seed: int) -> str:
         "tune/nll_preferred": [(step, 2.1 - 0.005 * step + 0.02 * seed) for step in tuned],
         "tune/nll_unpreferred": [(step, 2.1 + 0.005 * step + 0.02 * seed) for step in tuned],
         "tune/nll_demonstration": [(step, 4.0 + 0.01 * seed) for step in tuned],
-        "train/logit_std": [(step, 0.01 * step) for step in trained], "train/saturated": [(step, 0.0) for step in trained],
-        "train/kl": [(step, 0.005 * step) for step in trained], "train/entropy": [(step, 2 - 0.001 * step) for step in trained],
+        "train/logit_std": [(step, 0.01 * step) for step in trained],
+        "train/saturated": [(step, 0.0) for step in trained],
+        "train/kl": [(step, 0.005 * step) for step in trained],
+        "train/entropy": [(step, 2 - 0.001 * step) for step in trained],
     }  # fmt: skip
     for name, points in scalars.items():
         path = folder / run / "scalars" / f"{name}.csv"
@@ -187,7 +192,7 @@ def sensitivity() -> dict[str, Any]:
     names = ("ade", "time-aligned")
     return {
         "variants": {name: {"correlation": value(0.6), "overlap": value(0.5), "turned": value(0.1)} for name in names},
-        "margins": {title: dict.fromkeys(names, value(share)) for title, share in (("0–2 %", 0.55), ("over 40 %", 0.95))},
+        "margins": {"0–2 %": dict.fromkeys(names, value(0.55)), "over 40 %": dict.fromkeys(names, value(0.95))},
         "rollouts": {size: {"margin": value(0.3), "ade_agrees": value(0.7)} for size in ("8", "16")},
         "seconds": {"paper": 1.0, "time-aligned": 0.4}, "options": {},
         "made": {"command": "python -m recipes.sensitivity policies=[a.pt]", "config": {"seed": 0}},
@@ -201,7 +206,7 @@ def discriminator() -> dict[str, Any]:
     return {
         "labels": {"jerk": "mean squared jerk", "collision": "collision rate"},
         "correlation": {"jerk": {kind: value(mean) for kind, mean in kinds.items()}, "collision": dict.fromkeys(kinds)},
-        "realism": {kind: quarters for kind in ("discriminator", "distance", "ade")},
+        "realism": dict.fromkeys(("discriminator", "distance", "ade"), quarters),
         "auc": {"discriminator": value(0.9), "jerk": value(0.8)}, "smoothness_minus_distance": value(0.4),
     }  # fmt: skip
 
