@@ -133,7 +133,7 @@ def forest(
     """Values with their intervals, row by row.
 
     Args:
-        groups: for each kind (a marker of its own) values by row.
+        groups: for each kind (a marker of its own) values by row, whose name may have two lines.
         title: above the figure.
         x: what the axis shows.
         caption: below the figure.
@@ -153,7 +153,7 @@ def forest(
                 y=[value for y, _ in ends for value in (y, y, None)],
                 mode="lines", line={"color": shade, "width": 2.5}, hoverinfo="skip", showlegend=False, legendgroup=kind,
             )  # fmt: skip
-        hovers = [lines(f"{name}, {kind}") + "<br>" + each.text for name, each in values.items()]
+        hovers = [lines(f"{name}, {kind}".replace("\n", " ")) + "<br>" + each.text for name, each in values.items()]
         figure.add_scatter(
             x=[each.mean for each in values.values()], y=list(at.values()), mode="markers", name=kind, legendgroup=kind,
             marker=_dot(list(colour.values()), hollow=bool(place) and colours is None), showlegend=False,
@@ -174,7 +174,7 @@ def forest(
             "range": [min(ends) - room, max(ends) + room],
         },
         yaxis={
-            "tickvals": list(range(len(rows))), "ticktext": [escape(row, quote=False) for row in rows],
+            "tickvals": list(range(len(rows))), "ticktext": [lines(*row.split("\n")) for row in rows],
             "range": [len(rows) - 0.5, -0.5], "showgrid": False, "zeroline": False, "automargin": True,
             "fixedrange": True,
         },
@@ -274,9 +274,10 @@ def heat(
     """A matrix of numbers, coloured from ``low`` to ``high``."""
     figure = go.Figure(
         go.Heatmap(
-            z=[list(row) for row in values], x=[_broken(column) for column in columns], y=list(rows), zmin=low, zmax=high, showscale=False,
-            colorscale=[[0, "#ffffff"], [1, "#6fa8d6"]], xgap=2, ygap=2, hovertext=[list(row) for row in hover],
-            hoverinfo="text", text=[[f"{value:.2f}" for value in row] for row in values], texttemplate="%{text}",
+            z=[list(row) for row in values], x=[_broken(column) for column in columns],
+            y=[escape(row, quote=False) for row in rows], zmin=low, zmax=high, showscale=False, xgap=2, ygap=2,
+            colorscale=[[0, "#ffffff"], [1, "#6fa8d6"]], hovertext=[list(row) for row in hover], hoverinfo="text",
+            text=[[f"{value:.2f}" for value in row] for row in values], texttemplate="%{text}",
             textfont={"size": 11, "color": INK},
         )
     )  # fmt: skip
@@ -319,7 +320,7 @@ def _layout(named: int) -> dict[str, Any]:
     """
     return {
         "font": {"family": FONT, "size": 12, "color": INK},
-        "margin": {"l": 8, "r": 12, "t": 8, "b": 8},
+        "margin": {"l": 8, "r": 12, "t": 26, "b": 8},  # on top there is room for the buttons
         "paper_bgcolor": "white",
         "plot_bgcolor": "white",
         "showlegend": named > 1,

@@ -94,7 +94,8 @@ def player(packed: Mapping[str, Any]) -> Html:
     Args:
         packed: scenes and rollouts, see :func:`dpa.report.player.pack_players`.
     """
-    return filled("player.html", {"player_data": in_script(json.dumps(packed, separators=(",", ":"), allow_nan=False))})
+    data = in_script(json.dumps(packed, separators=(",", ":"), allow_nan=False))
+    return filled("player.html", {"player_data": data, "player_script": resource("player.js")})
 
 
 def _sections(study: Study, experiments: Iterable[str]) -> Iterable[Section]:

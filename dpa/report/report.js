@@ -22,7 +22,7 @@
     if (running) return;
     running = true;
     document.body.dataset.drawn = "no";
-    for (let next; (next = [...waiting].find((place) => place.offsetParent !== null));) {
+    for (let next; (next = [...waiting].find((place) => place.checkVisibility()));) {
       waiting.delete(next);
       await draw(next);
       await new Promise((resolve) => setTimeout(resolve));
@@ -33,7 +33,7 @@
 
   // The window may have changed while a figure was hidden.
   function refit(part) {
-    for (const place of part.querySelectorAll(".js-plotly-plot")) if (place.offsetParent) Plotly.Plots.resize(place);
+    for (const place of part.querySelectorAll(".js-plotly-plot")) if (place.checkVisibility()) Plotly.Plots.resize(place);
   }
 
   function select(tab) {

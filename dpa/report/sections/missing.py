@@ -21,7 +21,8 @@ def missing_section(study: Study, experiments: Iterable[str]) -> Section | None:
         for name in experiments
         if name not in study.experiments
     }
-    policies = ",".join(str(path) for path in sorted(folder.glob("seed_*/reference/policy.pt")))
+    references = sorted(folder.glob("seed_*/reference/policy.pt")) or ["POLICY.pt"]
+    policies = ",".join(map(str, references))
     lacking |= {
         name: f"python -m recipes.{name} policies=[{policies}] output={folder / name}"
         for name in STUDIES

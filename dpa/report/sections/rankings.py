@@ -47,7 +47,7 @@ def validity_section(found: Mapping[str, Any]) -> Section:
         curves(
             content,
             "Realism of a window of rollouts",
-            x="mean distance of the window over the scene's mean",
+            x="distance over the scene's mean",
             y="realism minus that of random rollouts",
             caption="Rollouts of a scene sorted by each distance, a window slid from the nearest to the farthest.",
             zero=True,
@@ -117,7 +117,8 @@ def sensitivity_section(found: Mapping[str, Any]) -> Section:
         ),
         heat(
             shares, names, list(margins), "Share of pairs in the same order", low=0.5, high=1.0, hover=told,
-            x="gap of a pair's distances over the scene's mean", caption="Half of the pairs agree by chance.",
+            x="gap of the pair",
+            caption="By the gap of a pair's distances over the scene's mean; half of the pairs agree by chance.",
         ),
         curves(
             pairs, "Pairs of the nearest and farthest quarter", x="rollouts of a scene", y="share", log_x=True,

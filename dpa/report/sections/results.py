@@ -160,7 +160,7 @@ def _differences(experiment: Experiment, comparison: Comparison, base: Any) -> d
         method, decoding = entry["method"], decoding_of(entry)
         against = (float(entry["against_top_p"]), float(entry["against_temperature"]))
         seeds = _by_seed(comparison, method, decoding, against)
-        name = experiment.label(method) + (f", {in_words(decoding)}" if method == REFERENCE else "")
+        name = experiment.label(method) + (f",\n{in_words(decoding)}" if method == REFERENCE else "")
         found[name] = Difference(
             entry["realism_difference"],
             *entry["ci95"],

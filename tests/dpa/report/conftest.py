@@ -1,13 +1,17 @@
-"""A small comparison with everything that a real one has, and a browser to open pages in."""
+"""A small comparison, a small study with everything that a real one has, its page, and a browser to open pages in."""
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 from matplotlib.figure import Figure
+
+from recipes.report import report
+from tests.dpa.report.runs import write_runs
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 """Names of an installed browser; where there is none, Playwright's own is used."""
@@ -67,6 +71,18 @@ def comparison() -> dict[str, Any]:
         "versions": {"torch": "2.13.0"},
         "command": "python -m recipes.compare 'name=<b>'",
     }  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of results with everything in it; tests that change it copy it first."""
+    return write_runs(tmp_path_factory.mktemp("runs"))
+
+
+@pytest.fixture(scope="session")
+def study_page(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its page, in a folder of its own."""
+    return report(runs, tmp_path_factory.mktemp("page"))
 
 
 @pytest.fixture

@@ -194,7 +194,7 @@ def sensitivity() -> dict[str, Any]:
         "variants": {name: {"correlation": value(0.6), "overlap": value(0.5), "turned": value(0.1)} for name in names},
         "margins": {"0–2 %": dict.fromkeys(names, value(0.55)), "over 40 %": dict.fromkeys(names, value(0.95))},
         "rollouts": {size: {"margin": value(0.3), "ade_agrees": value(0.7)} for size in ("8", "16")},
-        "seconds": {"paper": 1.0, "time-aligned": 0.4}, "options": {},
+        "seconds": {"paper": 1.0, "time-aligned": 0.4},
         "made": {"command": "python -m recipes.sensitivity policies=[a.pt]", "config": {"seed": 0}},
     }  # fmt: skip
 
