@@ -32,7 +32,9 @@ from recipes.jobs import (
 )
 from recipes.methods import levels, read_setups
 from recipes.models import policy_config
+from recipes.pictures import write_players
 from recipes.pool import Workers
+from recipes.report import report
 from recipes.runs import SNAPSHOT
 from recipes.scenes import open_splits
 from recipes.stages import Stages
@@ -69,6 +71,8 @@ def compare(cfg: DictConfig) -> dict[str, Any]:
         train_policies(cfg, stages)
         chosen = choose(cfg, stages)
         measure(cfg, stages, chosen)
+    if cfg.pictures.scenes:
+        write_players(cfg, splits[cfg.experiment.split], chosen.policies, chosen.decodings)
     found = summarise_experiment(cfg, splits, chosen.policies, chosen.decodings, stages.seconds)
     write_json(runs.experiment(cfg.experiment.name), found)
     return found
@@ -196,6 +200,7 @@ def main(cfg: DictConfig) -> None:
     own = found["own_best"]
     print_table(own["rows"], own["paired"], title="Each at its own best decoding, chosen on the tuning scenes")
     print(f"numbers: {runs_of(cfg).experiment(cfg.experiment.name)}")
+    print(f"report: {report(runs_of(cfg).root, runs_of(cfg).root / 'index.html')}")
 
 
 if __name__ == "__main__":

@@ -39,7 +39,12 @@ def report(runs: Path, out: Path) -> Path:
         plot_comparison(next(iter(study.experiments.values())), out)
         return out
     page = out if out.suffix == ".html" else out / "index.html"
-    return write_study(page, study, experiments=sorted(path.stem for path in EXPERIMENTS.glob("*.yaml")))
+    return write_study(page, study, experiments=known_experiments())
+
+
+def known_experiments() -> list[str]:
+    """Names of all experiments there are."""
+    return sorted(path.stem for path in EXPERIMENTS.glob("*.yaml") if path.stem != "base")
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -24,7 +24,7 @@ class Study:
     Attributes:
         folder: of the study.
         experiments: by name, ``methods`` first.
-        stages: seconds and jobs of each stage.
+        stages: seconds of each job of each stage.
         players: packed scenes and rollouts, see :func:`dpa.report.player.pack_players`.
         summaries: ``summary.json`` of each of :data:`STUDIES`.
         pictures: PNGs of each of :data:`STUDIES`.

@@ -34,8 +34,8 @@ def account_section(study: Study) -> Section | None:
 def _stages(study: Study) -> list[Html]:
     if not study.stages:
         return []
-    seconds = {name: float(entry["seconds"]) for name, entry in study.stages.items()}
-    jobs = {name: int(entry["jobs"]) for name, entry in study.stages.items()}
+    seconds = {name: math.fsum(jobs.values()) for name, jobs in study.stages.items()}
+    jobs = {name: len(entry) for name, entry in study.stages.items()}
     chart = bars(
         {name: spent / 3600 for name, spent in seconds.items()},
         f"Hours of each stage, {duration(sum(seconds.values()))} in all",
@@ -45,7 +45,7 @@ def _stages(study: Study) -> list[Html]:
     rows = [[name, duration(seconds[name]), str(jobs[name])] for name in seconds]
     rows.append(["all", duration(sum(seconds.values())), str(sum(jobs.values()))])
     shown = table(["stage", "time", "jobs"], rows)
-    note = hint("Time on the clock while the stage ran, all experiments together (stages.json).")
+    note = hint("Time of one worker, each job as it was done first, all experiments together (stages.json).")
     return [element("div", drawn(chart), element("div", shown, note), class_="gallery")]
 
 

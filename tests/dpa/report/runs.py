@@ -13,9 +13,8 @@ from dpa.preferences.examples import example_groups, example_provenance
 from dpa.preferences.writer import PreferenceWriter
 from dpa.report.player import PlayerScene, pack_players
 from dpa.report.statistics import paired_bootstrap
-from envs.render import pose_tracks
-from envs.scene import CURRENT_STEP
 from envs.sources.synthetic import straight_road
+from tests.dpa.report.made_rollouts import judged, slower
 
 SEEDS = (0, 1, 2)
 SCENES = 12
@@ -40,6 +39,12 @@ FIGURES = (
 )  # fmt: skip
 PUBLISHED = {"dpa_omf": {"kinematic": 0.415, "realism": 0.739, "min_ade": 1.413, "pair_accuracy": 0.84}}
 
+STAGES = {
+    "pretrain": {f"pretrain {seed}": 1800.0 for seed in range(3)},
+    "align": {f"align {job}": 200.0 for job in range(9)},
+}
+"""Seconds of each job."""
+
 
 def write_runs(folder: Path) -> Path:
     """Write the whole study: three experiments, stages, stores, curves, studies of rankings and a scene to play."""
@@ -48,7 +53,7 @@ def write_runs(folder: Path) -> Path:
     write_experiment(folder, "scaling", ["reference", "r1", "r4", "r16"], headline="r16", axis=axis)
     snapshots = ["reference", "dpa_omf@20", "dpa_omf@40", "dpa_omf"]
     write_experiment(folder, "steps", snapshots)
-    write(folder / "stages.json", {"pretrain": {"seconds": 5400.0, "jobs": 3}, "align": {"seconds": 1800.0, "jobs": 9}})
+    write(folder / "stages.json", STAGES)
     for seed in SEEDS[:2]:
         with PreferenceWriter(folder / f"seed_{seed}" / "preferences_train", example_provenance()) as writer:
             writer.append(example_groups(num_scenes=3))
@@ -215,8 +220,7 @@ def players() -> dict[str, Any]:
     """One scene with a rollout that is its log."""
     scene = straight_road(2)
     scene.scene_id = "</script><b>made up"
-    log = pose_tracks(scene)[scene.agents.present, CURRENT_STEP + 1 :]
-    return pack_players([PlayerScene(scene, {"reference": log[None]})])
+    return pack_players([PlayerScene(scene, {"reference": judged(scene, [slower(scene, 0)], [-1.0])})])
 
 
 def write(path: Path, content: Any) -> None:

@@ -1,0 +1,63 @@
+"""Scenes and rollouts of an experiment's policies for the player of the page (METHOD figures 5, 8 and 9)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from omegaconf import DictConfig
+
+from dpa.policy import Decoding
+from dpa.report.player import pack_players
+from envs.store import SceneStore
+from recipes.cli import write_json
+from recipes.jobs import runs_of
+from recipes.models import open_policy, weights_digest
+from recipes.play import roll_out
+from recipes.rankings import build_distance
+from recipes.scenes import fingerprint
+from recipes.summary import labels
+
+
+def write_players(
+    cfg: DictConfig, scenes: SceneStore, policies: Mapping[str, str], decodings: Mapping[str, Decoding]
+) -> None:
+    """Roll the policies of the first seed out in some scenes, each at its own best decoding, and keep what is shown.
+
+    Args:
+        cfg: of the experiment; ``pictures`` names the number of scenes, rollouts and those kept.
+        scenes: of the reported split; the first ones are shown.
+        policies: method -> the policy that stands for it.
+        decodings: of each method.
+    """
+    runs, seed, options = runs_of(cfg), cfg.seeds[0], cfg.pictures
+    files = {method: runs.policy(seed, policy) for method, policy in policies.items()}
+    named = labels(cfg, policies)
+    decided_by = {
+        "policies": {method: weights_digest(open_policy(path)[0]) for method, path in files.items()},
+        "decodings": {method: asdict(decodings[method]) for method in files},
+        "scenes": fingerprint(scenes),
+        "options": dict(options),
+        "seed": seed,
+    }
+    if kept_players(runs.players).get("options") == decided_by:
+        return
+    players = roll_out(
+        {named[method]: path for method, path in files.items()},
+        scenes,
+        range(min(options.scenes, len(scenes))),
+        decoding={named[method]: decodings[method] for method in files},
+        num_rollouts=options.num_rollouts,
+        kept=options.kept,
+        distance=build_distance(cfg.collection.ranking, "collection.ranking"),
+        seed=seed,
+        device=cfg.device,
+    )
+    write_json(runs.players, pack_players(players) | {"options": decided_by})
+
+
+def kept_players(path: Any) -> dict[str, Any]:
+    """What an earlier run has rolled out; empty where there is nothing."""
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
