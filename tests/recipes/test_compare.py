@@ -1,4 +1,4 @@
-"""The main job, whole and killed: the comparison of six methods on tiny scenes."""
+"""The main job, whole and killed: experiments on tiny scenes, all in one folder, and the page of what they found."""
 
 from __future__ import annotations
 
@@ -9,66 +9,104 @@ from typing import Any
 
 import pytest
 
+from recipes.report import known_experiments
+
 METHODS = ["dpa_omf", "dpa_adef", "sft_best_oa", "sft_best_ade", "adversarial_afd"]
 SMALL = [
     "seeds=[0]",
-    "decoding.grid=[0.95,0.5]",
+    "decoding.grid=[[0.95,1.0],[0.95,0.5]]",
     "decoding.num_rollouts=2",
-    "pictures=1",
-    *(f"methods.{method}.data.num=2" for method in METHODS),
+    "drift_rollouts=2",
+    "alignment.watch_interval=2",
 ]
-OF_THE_MACHINE = ("stages", "wall_seconds", "versions", "command")
+OF_THE_MACHINE = ("stages", "wall_seconds", "versions", "command", "config", "date")
 """What differs between two runs of the same options."""
 
 pytestmark = pytest.mark.slow
 
 
-def command(options: Callable, output: Path, workers: int = 1) -> list[str]:
-    return options("compare", *SMALL, f"workers={workers}", f"output={output}")
+def command(options: Callable, output: Path, *more: str, workers: int = 1) -> list[str]:
+    return options("compare", *SMALL, f"workers={workers}", f"output={output}", *more)
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory, run: Callable, options: Callable) -> Path:
-    """The folder of a comparison that nothing interrupted."""
+    """The folder of the comparison of methods that nothing interrupted."""
     folder = tmp_path_factory.mktemp("compare")
-    outcome = run("compare", *command(options, folder))
+    outcome = run("compare", *command(options, folder, "pictures={scenes:1,num_rollouts:4,kept:2}"))
     assert outcome.status == 0, outcome.err
     assert "index.html" in outcome.out
     return folder
 
 
-def comparison(folder: Path) -> dict[str, Any]:
-    return json.loads((folder / "comparison.json").read_text())
+def experiment(folder: Path, name: str = "methods") -> dict[str, Any]:
+    return json.loads((folder / "experiments" / f"{name}.json").read_text())
 
 
 def test_every_method_is_compared_with_the_reference(finished: Path) -> None:
-    found = comparison(finished)
+    found = experiment(finished)
     assert found["scenes"] == {"train": 6, "tune": 2, "eval": 3, "source": "store"}
-    at_common = [row["method"] for row in found["rows"] if row["top_p"] == 0.95]
-    assert at_common[:6] == ["reference", *METHODS]
-    assert [entry["method"] for entry in found["paired"]][:5] == METHODS
+    at_common = [row["method"] for row in found["rows"] if row["temperature"] == 1.0]
+    assert at_common == ["reference", *METHODS] == found["methods"]
+    assert [entry["method"] for entry in found["paired"]] == [*METHODS, "reference"]
     assert {row["method"] for row in found["own_best"]["rows"]} == {"reference", *METHODS}
+    assert len(found["tuning"]) == 6 * 2
     for row in found["rows"]:
         assert 0 < row["realism"] <= 1 and 0 <= row["pair_accuracy"] <= 1 and row["n_scenes"] == 3
-    assert set(found["per_scene"]) == {"reference", *METHODS}
+    drift = {entry["method"]: entry["kl"] for entry in found["likelihood"]}
+    assert drift.pop("reference") == pytest.approx(0, abs=1e-6) and all(kl > 1e-6 for kl in drift.values())
 
 
-def test_the_report_shows_figures_and_scenes(finished: Path) -> None:
+def test_a_reader_finds_the_values_of_every_scene_behind_a_number(finished: Path) -> None:
+    for row in experiment(finished)["rows"]:
+        behind = json.loads((finished / row["file"]).read_text())
+        values = behind["per_scene"]["realism"]
+        assert len(values) == len(behind["scenes"]) == 3
+        assert sum(values) / 3 == pytest.approx(row["realism"])
+        assert behind["options"]["seed"] == row["seed"] and behind["options"]["decoding"]["top_p"] == row["top_p"]
+
+
+def test_likelihoods_are_followed_along_the_alignment_of_every_method(finished: Path) -> None:
+    for method, folders in experiment(finished)["curves"].items():
+        rows = (finished / folders["0"] / "scalars/tune/nll_preferred.csv").read_text().splitlines()
+        assert [row.split(",")[0] for row in rows] == ["0", "2", "4"], method
+
+
+def test_the_page_shows_methods_and_scenes(finished: Path) -> None:
     page = (finished / "index.html").read_text()
-    assert "DPA-OMF" in page or "dpa_omf" in page
-    for picture in ("comparison", "own_best", "curves", "pretraining", "scenes"):
-        assert (finished / f"{picture}.png").stat().st_size > 1000
+    assert "DPA-OMF" in page and "plotly" in page.lower() and "player" in page
+    players = json.loads((finished / "players.json").read_text())
+    assert set(players["scenes"][0]["rollouts"]) == set(experiment(finished)["labels"].values())
+
+
+@pytest.mark.parametrize("name", [name for name in known_experiments() if name != "methods"])
+def test_every_experiment_runs_in_the_folder_of_the_first(
+    run: Callable, options: Callable, finished: Path, name: str
+) -> None:
+    reference = (finished / "seed_0/reference/policy.pt").stat().st_mtime_ns
+    more = [f"experiment={name}"]
+    if name in ("scaling", "step_size"):
+        more.append("alignment.snapshots=[2]")
+    outcome = run("compare", *command(options, finished, *more))
+    assert outcome.status == 0, outcome.err
+    found = experiment(finished, name)
+    assert {row["method"] for row in found["own_best"]["rows"]} == set(found["methods"])
+    assert (finished / "seed_0/reference/policy.pt").stat().st_mtime_ns == reference, "made once for all experiments"
+    assert found["title"] in (finished / "index.html").read_text()
+    if found["split"] == "tune":
+        assert all(Path(row["file"]).name.startswith("tune_") for row in found["rows"])
 
 
 def test_a_finished_comparison_does_nothing_again(run: Callable, options: Callable, finished: Path) -> None:
     policies = sorted(finished.rglob("*.pt"))
-    before = comparison(finished)
-    assert run("compare", *command(options, finished)).status == 0
-    after = comparison(finished)
+    before, account = experiment(finished), json.loads((finished / "stages.json").read_text())
+    assert run("compare", *command(options, finished, "pictures={scenes:1,num_rollouts:4,kept:2}")).status == 0
+    after = experiment(finished)
     assert {k: v for k, v in after.items() if k not in OF_THE_MACHINE} == {
         k: v for k, v in before.items() if k not in OF_THE_MACHINE
     }
     assert sorted(finished.rglob("*.pt")) == policies
+    assert json.loads((finished / "stages.json").read_text()) == account
 
 
 @pytest.mark.parametrize(
@@ -76,18 +114,18 @@ def test_a_finished_comparison_does_nothing_again(run: Callable, options: Callab
     [
         (1, "seed_0/preferences_train/metadata.json"),
         (2, "seed_0/dpa_omf/checkpoints/step_0000000002.pt"),
-        (1, "seed_0/sft_best_oa/tune_top_p_0.95.json"),
+        (1, "seed_0/sft_best_oa/tune_top_p_0.95_t_1.json"),
     ],
 )
 def test_a_killed_comparison_ends_like_one_that_nothing_interrupted(
     run: Callable, options: Callable, kill_when: Callable, finished: Path, tmp_path: Path, workers: int, sign: str
 ) -> None:
     output = tmp_path / "compare"
-    kill_when((output / sign).exists, "compare", *command(options, output, workers))
-    assert not (output / "comparison.json").exists()
-    outcome = run("compare", *command(options, output))
+    kill_when((output / sign).exists, "compare", *command(options, output, "pictures.scenes=0", workers=workers))
+    assert not (output / "experiments").exists()
+    outcome = run("compare", *command(options, output, "pictures.scenes=0"))
     assert outcome.status == 0, outcome.err
-    mine, whole = comparison(output), comparison(finished)
+    mine, whole = experiment(output), experiment(finished)
     for name in OF_THE_MACHINE:
         mine.pop(name), whole.pop(name)
     assert mine == whole
