@@ -19,7 +19,7 @@ MEASURES: dict[str, tuple[Callable[[Motion], Tensor | None], bool]] = {
     "close_pass": (close_pass, False),
     "harsh_jerk": (harsh_jerk, True),
 }
-"""Motion -> ``[K, A]`` bool by name, and whether it is about vehicles only; agents that nobody controls never count."""
+"""Motion -> ``[K, A]`` bool by name, and whether it is about controlled vehicles only, or about all agents."""
 
 
 def safety(scene: Scene, trajectories: Tensor, controlled: Tensor) -> dict[str, float | None]:

@@ -1,18 +1,23 @@
-"""Curves of a run: always one CSV file per metric, and Weights & Biases or TensorBoard on request.
+"""Curves, tables and pictures of a run: always as files, and in Weights & Biases or TensorBoard on request.
 
-The files lie as torchrl's ``CSVLogger`` lays them out, ``<folder>/scalars/<metric>.csv`` with rows ``step,value`` and
-no header, so its readers work. Unlike it, a resumed run drops the rows that it is about to write again.
+Curves lie as torchrl's ``CSVLogger`` lays them out, ``<folder>/scalars/<metric>.csv`` with rows ``step,value`` and no
+header, so its readers work. Unlike it, a resumed run drops the rows that it is about to write again. A table is
+``<folder>/tables/<name>/<step>.csv`` with a header, a picture ``<folder>/pictures/<name>/<step>.png`` (or ``.jpg``).
 """
 
 from __future__ import annotations
 
+import csv
 import importlib.util
+import io
 import json
 import os
 import secrets
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Protocol, TextIO
+
+from dpa.training.exhibits import Picture, Table, as_markdown, as_picture, as_table
 
 Backend = Literal["csv", "wandb", "tensorboard"]
 MODULES = {"wandb": "wandb", "tensorboard": "tensorboard"}
@@ -20,10 +25,40 @@ MODULES = {"wandb": "wandb", "tensorboard": "tensorboard"}
 
 
 class MetricLogger(Protocol):
-    """Where a run's numbers go."""
+    """Where a run's numbers, tables and pictures go.
+
+    There is one table, and one picture, for a name and a step. What an earlier run wrote up to the step that this run
+    goes on from stays, and is not written again.
+    """
 
     def log(self, metrics: Mapping[str, Any], step: int) -> None:
         """Write numbers or tensors of one element, named ``"<group>/<metric>"``, for one step."""
+
+    def table(self, name: str, header: Sequence[str], rows: Sequence[Sequence[Any]], step: int) -> None:
+        """Write a table.
+
+        Args:
+            name: ``"<group>/<table>"``.
+            header: names of the columns.
+            rows: cells are texts, numbers, tensors of one element, or None for what is not known.
+            step: that the table is about.
+
+        Raises:
+            ValueError: no table, or this run has written one of this name and step.
+        """
+
+    def picture(self, name: str, picture: Any, step: int) -> None:
+        """Write a picture.
+
+        Args:
+            name: ``"<group>/<picture>"``.
+            picture: path of a PNG or JPEG file; or an array or tensor ``[H, W]`` or ``[H, W, 3]``, uint8 or floating
+                point from 0 to 1.
+            step: that the picture is about.
+
+        Raises:
+            ValueError: no picture, or this run has written one of this name and step.
+        """
 
     def close(self) -> None:
         """Flush and close; a closed logger is not used again."""
@@ -39,16 +74,16 @@ def make_logger(
     name: str | None = None,
     mode: Literal["online", "offline"] = "offline",
 ) -> MetricLogger:
-    """Open the curves of a run.
+    """Open the curves, tables and pictures of a run.
 
-    CSV is always written; ``backend`` says where else the same numbers go.
+    Files are always written; ``backend`` says where else the same goes.
 
     Args:
         backend: ``"csv"``, ``"wandb"`` or ``"tensorboard"``.
         folder: the run's folder. ``config.json`` in it records ``config``.
         config: the run's configuration, plain dicts, lists, numbers and strings.
-        resume_step: the step of the checkpoint that the run goes on from: rows of later steps are dropped. ``None``
-            for a new run, which drops all rows of an earlier run in the folder.
+        resume_step: the step of the checkpoint that the run goes on from: what is of later steps is dropped. ``None``
+            for a new run, which drops all of an earlier run in the folder.
         project: project of Weights & Biases.
         name: name of the run there; the folder's name by default.
         mode: of Weights & Biases; ``"offline"`` keeps the run in ``folder`` and sends nothing.
@@ -62,9 +97,12 @@ def make_logger(
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     logger = make_logger("csv", folder, {"lr": 1e-3})
         ...     logger.log({"train/loss": 0.5}, step=1)
+        ...     logger.table("eval/methods", ["method", "realism"], [["reference", 0.7]], step=1)
         ...     logger.close()
         ...     read_curve(Path(folder), "train/loss")
+        ...     Path(folder, "tables", "eval", "methods", "1.csv").read_text().splitlines()
         [(1, 0.5)]
+        ['method,realism', 'reference,0.7']
     """
     if backend not in ("csv", *MODULES):
         raise ValueError(f"logger.backend must be csv, wandb or tensorboard, got {backend!r}.")
@@ -74,12 +112,12 @@ def make_logger(
             f"(pip install {MODULES[backend]}) or choose logger.backend=csv."
         )
     folder = Path(folder)
-    loggers: list[MetricLogger] = [CsvLogger(folder, config, resume_step)]
+    files = CsvLogger(folder, config, resume_step)
     if backend == "wandb":
-        loggers.append(_WandbLogger(folder, config, resume_step, project, name or folder.name, mode))
-    elif backend == "tensorboard":
-        loggers.append(_TensorboardLogger(folder, resume_step))
-    return _Tee(loggers)
+        return _Tee(files, _WandbLogger(folder, config, resume_step, project, name or folder.name, mode))
+    if backend == "tensorboard":
+        return _Tee(files, _TensorboardLogger(folder, resume_step))
+    return files
 
 
 def read_curve(folder: str | os.PathLike[str], metric: str) -> list[tuple[int, float]]:
@@ -98,7 +136,7 @@ def read_curve(folder: str | os.PathLike[str], metric: str) -> list[tuple[int, f
 
 
 class CsvLogger:
-    """One file ``scalars/<metric>.csv`` per metric; see :func:`make_logger` for the arguments."""
+    """One file for each metric, table and picture; see :func:`make_logger` for the arguments."""
 
     def __init__(self, folder: Path, config: Mapping[str, Any], resume_step: int | None) -> None:
         text = json.dumps(config, indent=2, sort_keys=True)
@@ -106,7 +144,10 @@ class CsvLogger:
         _replace_text(folder / "config.json", text + "\n")
         for path in _curves(folder):
             _drop_rows_after(path, resume_step)
-        self._folder = folder
+        for path in _exhibits(folder):
+            if resume_step is None or int(path.stem) > resume_step:
+                path.unlink()
+        self._folder, self._resume_step = folder, resume_step
         self._files: dict[str, TextIO] = {}
 
     def log(self, metrics: Mapping[str, Any], step: int) -> None:
@@ -118,6 +159,34 @@ class CsvLogger:
                 self._files[name] = path.open("a")
             self._files[name].write(f"{step},{value}\n")
             self._files[name].flush()
+
+    def table(self, name: str, header: Sequence[str], rows: Sequence[Sequence[Any]], step: int) -> None:
+        """Write ``tables/<name>/<step>.csv``; see :class:`MetricLogger`."""
+        self.keep_table(as_table(name, header, rows), step)
+
+    def picture(self, name: str, picture: Any, step: int) -> None:
+        """Write ``pictures/<name>/<step>.png`` or copy the file there; see :class:`MetricLogger`."""
+        self.keep_picture(as_picture(name, picture), step)
+
+    def keep_table(self, table: Table, step: int) -> bool:
+        """Write a table; False if an earlier run has done it."""
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([table.header, *table.rows])
+        return self._keep("tables", table.name, step, "csv", text.getvalue().encode())
+
+    def keep_picture(self, picture: Picture, step: int) -> bool:
+        """Write a picture; False if an earlier run has done it."""
+        return self._keep("pictures", picture.name, step, picture.suffix, picture.content)
+
+    def _keep(self, kind: str, name: str, step: int, suffix: str, content: bytes) -> bool:
+        folder = self._folder / kind / name
+        if any(folder.glob(f"{step}.*")):
+            if self._resume_step is not None and step <= self._resume_step:
+                return False
+            raise ValueError(f"{kind}/{name} of step {step} has been written already; give another name or step.")
+        folder.mkdir(parents=True, exist_ok=True)
+        _replace_bytes(folder / f"{step}.{suffix}", content)
+        return True
 
     def close(self) -> None:
         """Close the files."""
@@ -148,6 +217,17 @@ class _WandbLogger:
     def log(self, metrics: Mapping[str, Any], step: int) -> None:
         self._run.log({"step": step, **_as_floats(metrics)})
 
+    def show_table(self, table: Table, step: int) -> None:
+        from wandb import Table as WandbTable
+
+        shown = WandbTable(columns=table.header, data=table.rows, allow_mixed_types=True)
+        self._run.log({"step": step, table.name: shown})
+
+    def show_picture(self, picture: Picture, step: int) -> None:
+        from wandb import Image
+
+        self._run.log({"step": step, picture.name: Image(picture.pixels)})
+
     def close(self) -> None:
         self._run.finish()
 
@@ -165,24 +245,40 @@ class _TensorboardLogger:
         for name, value in _as_floats(metrics).items():
             self._writer.add_scalar(name, value, step)
 
+    def show_table(self, table: Table, step: int) -> None:
+        self._writer.add_text(table.name, as_markdown(table), step)
+
+    def show_picture(self, picture: Picture, step: int) -> None:
+        self._writer.add_image(picture.name, picture.pixels, step, dataformats="HWC")
+
     def close(self) -> None:
         self._writer.close()
 
 
 class _Tee:
-    """Writes to several loggers."""
+    """Writes files, and shows the same elsewhere. The files say what an earlier run has shown."""
 
-    def __init__(self, loggers: list[MetricLogger]) -> None:
-        self._loggers = loggers
+    def __init__(self, files: CsvLogger, screen: _WandbLogger | _TensorboardLogger) -> None:
+        self._files, self._screen = files, screen
 
     def log(self, metrics: Mapping[str, Any], step: int) -> None:
         metrics = _as_floats(metrics)
-        for logger in self._loggers:
-            logger.log(metrics, step)
+        self._files.log(metrics, step)
+        self._screen.log(metrics, step)
+
+    def table(self, name: str, header: Sequence[str], rows: Sequence[Sequence[Any]], step: int) -> None:
+        table = as_table(name, header, rows)
+        if self._files.keep_table(table, step):
+            self._screen.show_table(table, step)
+
+    def picture(self, name: str, picture: Any, step: int) -> None:
+        picture = as_picture(name, picture)
+        if self._files.keep_picture(picture, step):
+            self._screen.show_picture(picture, step)
 
     def close(self) -> None:
-        for logger in self._loggers:
-            logger.close()
+        self._files.close()
+        self._screen.close()
 
 
 def _as_floats(metrics: Mapping[str, Any]) -> dict[str, float]:
@@ -202,6 +298,11 @@ def _curves(folder: Path) -> list[Path]:
     return sorted((folder / "scalars").rglob("*.csv"))
 
 
+def _exhibits(folder: Path) -> list[Path]:
+    found = [*(folder / "tables").rglob("*"), *(folder / "pictures").rglob("*")]
+    return sorted(path for path in found if path.is_file() and path.stem.isdigit())
+
+
 def _complete_rows(path: Path) -> list[list[str]]:
     lines = path.read_text().splitlines(keepends=True)
     return [line.strip().split(",") for line in lines if line.endswith("\n")]
@@ -216,6 +317,10 @@ def _drop_rows_after(path: Path, step: int | None) -> None:
 
 
 def _replace_text(path: Path, text: str) -> None:
+    _replace_bytes(path, text.encode())
+
+
+def _replace_bytes(path: Path, content: bytes) -> None:
     temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_text(text)
+    temporary.write_bytes(content)
     os.replace(temporary, path)

@@ -58,7 +58,8 @@ def test_a_vehicle_that_drives_against_the_nearest_lane_is_on_the_wrong_way(
 
 @pytest.mark.parametrize(("seconds", "share"), [(0.4, 0.0), (1.6, 1.0)])
 def test_less_than_a_second_on_the_wrong_side_does_not_count(seconds: float, share: float) -> None:
-    y = torch.where((AHEAD > 2) & (2.05 + seconds > AHEAD), 2.5, -2.5)
+    part = (AHEAD - 2) / seconds
+    y = torch.where((part > 0.01) & (part < 1.01), 2.5, -2.5)
     assert measured(straight_road(1), driving(10 * AHEAD, y))["wrong_way"] == share
 
 

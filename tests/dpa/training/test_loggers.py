@@ -1,15 +1,25 @@
-"""Curves: layout on disk, resume without repeated steps, and the further backends."""
+"""Curves, tables and pictures: layout on disk, resume without repetition, and what the further backends hold."""
 
 from __future__ import annotations
 
+import csv
 import importlib.util
+import io
 import json
+import time
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from dpa.training.loggers import make_logger, read_curve
+
+HEADER = ["method", "realism", "scenes"]
+ROWS = [["reference", 0.5625, 54], ["a|b, c", None, 7]]
+PIXELS = (np.arange(4 * 6 * 3) * 3).astype(np.uint8).reshape(4, 6, 3)
 
 
 def write(folder: Path, steps: range, resume_step: int | None = None, backend: str = "csv") -> None:
@@ -103,6 +113,201 @@ def test_wandb_offline_keeps_its_run_over_a_resume(tmp_path: Path) -> None:
     assert (tmp_path / "wandb_id.txt").read_text() == run_id
     assert len(list((tmp_path / "wandb").glob(f"offline-run-*-{run_id.strip()}"))) >= 1
     assert [step for step, _ in read_curve(tmp_path, "train/loss")] == [0, 1, 2, 3]
+
+
+# --- tables and pictures ---------------------------------------------------------------------------------------------
+
+
+def show(folder: Path, steps: range, resume_step: int | None = None, backend: str = "csv") -> None:
+    """A run that logs a number, a table and a picture at each step."""
+    logger = make_logger(backend, folder, {"lr": 0.1}, resume_step=resume_step)
+    for step in steps:
+        logger.log({"train/loss": step / 2}, step)
+        logger.table("eval/methods", HEADER, [*ROWS, ["step", torch.tensor(step / 4), np.int64(step)]], step)
+        logger.picture("eval/scene", PIXELS + np.uint8(step), step)
+    logger.close()
+
+
+def decoded(content: bytes) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(content)))
+
+
+def test_a_table_and_a_picture_are_a_file_for_each_step(tmp_path: Path) -> None:
+    show(tmp_path, range(2))
+    with (tmp_path / "tables" / "eval" / "methods" / "1.csv").open(newline="") as file:
+        cells = [["reference", "0.5625", "54"], ["a|b, c", "", "7"], ["step", "0.25", "1"]]
+        assert list(csv.reader(file)) == [HEADER, *cells]
+    for step in range(2):
+        picture = (tmp_path / "pictures" / "eval" / "scene" / f"{step}.png").read_bytes()
+        assert np.array_equal(decoded(picture), PIXELS + step)
+
+
+def test_a_picture_file_is_kept_to_the_byte(tmp_path: Path) -> None:
+    logger = make_logger("csv", tmp_path / "run", {})
+    for step, name in enumerate(("drawn.png", "taken.jpeg")):
+        Image.fromarray(PIXELS).save(tmp_path / name)
+        logger.picture("eval/scene", tmp_path / name, step)
+    logger.close()
+    kept = tmp_path / "run" / "pictures" / "eval" / "scene"
+    assert (kept / "0.png").read_bytes() == (tmp_path / "drawn.png").read_bytes()
+    assert (kept / "1.jpg").read_bytes() == (tmp_path / "taken.jpeg").read_bytes()
+
+
+def test_greys_and_shares_become_colours(tmp_path: Path) -> None:
+    logger = make_logger("csv", tmp_path, {})
+    logger.picture("grey", PIXELS[..., 0], 0)
+    logger.picture("shares", torch.tensor(PIXELS / 255.0), 0)
+    logger.close()
+    grey, shares = (decoded((tmp_path / "pictures" / name / "0.png").read_bytes()) for name in ("grey", "shares"))
+    assert np.array_equal(grey, np.repeat(PIXELS[..., :1], 3, -1))
+    assert np.array_equal(shares, PIXELS)
+
+
+def test_a_resume_keeps_what_was_written_and_drops_what_comes_again(tmp_path: Path) -> None:
+    show(tmp_path, range(4))
+    kept = tmp_path / "tables" / "eval" / "methods" / "1.csv"
+    before = kept.stat().st_mtime_ns
+    show(tmp_path, range(1, 3), resume_step=1)
+    assert sorted(path.name for path in kept.parent.iterdir()) == ["0.csv", "1.csv", "2.csv"]
+    assert kept.stat().st_mtime_ns == before
+    show(tmp_path, range(1))
+    assert [path.name for path in kept.parent.iterdir()] == ["0.csv"], "a new run drops all of an earlier one"
+    assert [path.name for path in (tmp_path / "pictures" / "eval" / "scene").iterdir()] == ["0.png"]
+
+
+def test_a_run_writes_a_table_or_picture_of_a_step_once(tmp_path: Path) -> None:
+    logger = make_logger("csv", tmp_path, {})
+    for write_again in (
+        lambda: logger.table("eval/methods", HEADER, ROWS, 3),
+        lambda: logger.picture("eval/methods", PIXELS, 3),
+    ):
+        write_again()
+        with pytest.raises(ValueError, match="eval/methods of step 3 has been written already"):
+            write_again()
+
+
+@pytest.mark.parametrize(
+    ("name", "header", "rows", "message"),
+    [
+        ("", HEADER, ROWS, "the name of a table must be like group/name, got ''"),
+        ("../eval", HEADER, ROWS, "must be like group/name, got '../eval'"),
+        ("eval", "method", ROWS, "needs a header of column names, got 'method'"),
+        ("eval", [], [], "needs a header of column names"),
+        ("eval", ["a", "a"], [[1, 2]], "has a column twice"),
+        ("eval", HEADER, [["reference", 0.5]], r"which the row \['reference', 0.5\] does not fit"),
+        ("eval", HEADER, ["abc"], "which the row 'abc' does not fit"),
+        ("eval", HEADER, [["a", torch.zeros(2), 1]], "in the column 'realism' that is neither text nor number: Tensor"),
+        ("eval", HEADER, [["a", {}, 1]], "neither text nor number: dict"),
+    ],
+)
+def test_what_is_no_table_is_refused(tmp_path: Path, name: str, header: Any, rows: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_logger("csv", tmp_path, {}).table(name, header, rows, 0)
+    assert not (tmp_path / "tables").exists()
+
+
+@pytest.mark.parametrize(
+    ("picture", "message"),
+    [
+        ("nowhere.png", "nowhere.png is no PNG or JPEG file that can be read"),
+        (__file__, "is no PNG or JPEG file that can be read"),
+        (PIXELS[0, 0], r"must be \[H, W\] or \[H, W, 3\], got the shape \[3\]"),
+        (np.zeros((3, 4, 6)), r"got the shape \[3, 4, 6\]"),
+        (np.zeros((0, 6, 3)), r"got the shape \[0, 6, 3\]"),
+        (PIXELS.astype(np.int64), "must be uint8, or floating point from 0 to 1, got int64"),
+        (np.full((4, 6), 255.0), "must be from 0 to 1; scale it"),
+        (np.full((4, 6), np.nan), "must be from 0 to 1; scale it"),
+    ],
+)
+def test_what_is_no_picture_is_refused(tmp_path: Path, picture: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_logger("csv", tmp_path, {}).picture("eval/scene", picture, 0)
+    assert not (tmp_path / "pictures").exists()
+
+
+def test_tensorboard_holds_every_table_and_picture_once(tmp_path: Path) -> None:
+    # What TensorBoard itself shows: its public accumulator does not drop the texts that a resume repeats.
+    from tensorboard.backend.event_processing.plugin_event_accumulator import EventAccumulator
+    from tensorboard.util.tensor_util import make_ndarray
+
+    show(tmp_path, range(4), backend="tensorboard")
+    show(tmp_path, range(1, 4), resume_step=1, backend="tensorboard")
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    tables = events.Tensors("eval/methods/text_summary")
+    assert [event.step for event in tables] == [0, 1, 2, 3]
+    text = make_ndarray(tables[3].tensor_proto).item().decode()
+    assert text.splitlines() == [
+        "| method | realism | scenes |",
+        "| --- | --- | --- |",
+        "| reference | 0.5625 | 54 |",
+        r"| a\|b, c | – | 7 |",
+        "| step | 0.75 | 3 |",
+    ]
+    pictures = events.Tensors("eval/scene")
+    assert [event.step for event in pictures] == [0, 1, 2, 3]
+    for event in pictures:
+        width, height, content = make_ndarray(event.tensor_proto)
+        assert (int(width), int(height)) == (6, 4)
+        assert np.array_equal(decoded(content), PIXELS + event.step)
+
+
+def wandb_records(run: Path) -> list[Any]:
+    """Records of an offline run: its file is a header of 7 bytes, then blocks of checksummed pieces of records."""
+    from wandb.proto.wandb_internal_pb2 import Record
+
+    data, place, content, records = run.read_bytes(), 7, b"", []
+    while place + 7 <= len(data):
+        left = 32768 - place % 32768
+        if left < 7:
+            place += left
+            continue
+        length, kind = int.from_bytes(data[place + 4 : place + 6], "little"), data[place + 6]
+        content += data[place + 7 : place + 7 + length]
+        place += 7 + length
+        if kind in (1, 4):  # a whole record, or the last piece of one
+            records.append(Record.FromString(content))
+            content = b""
+    return records
+
+
+def wandb_history(run: Path) -> list[dict[str, Any]]:
+    """Rows that an offline run logged, once the process that writes them has closed it."""
+    deadline = time.monotonic() + 60
+    while not any(record.HasField("exit") for record in wandb_records(run)):
+        assert time.monotonic() < deadline, f"{run} was not closed"
+        time.sleep(0.1)
+    histories = [record.history for record in wandb_records(run) if record.HasField("history")]
+    return [
+        {"/".join(item.nested_key) or item.key: json.loads(item.value_json) for item in history.item}
+        for history in histories
+    ]
+
+
+def test_wandb_holds_the_numbers_the_cells_and_the_pixels(tmp_path: Path) -> None:
+    show(tmp_path, range(1, 3), backend="wandb")
+    (run,) = (tmp_path / "wandb").glob("offline-run-*")
+    rows = wandb_history(next(run.glob("*.wandb")))
+    assert [(row["step"], row["train/loss"]) for row in rows if "train/loss" in row] == [(1, 0.5), (2, 1.0)]
+    for kind in ("table", "image"):
+        assert [row["step"] for row in rows if any(f"{kind}-file" in str(value) for value in row.values())] == [1, 2]
+    tables = sorted((run / "files" / "media" / "table" / "eval").iterdir())
+    for step, table in zip((1, 2), tables, strict=True):
+        shown = json.loads(table.read_text())
+        assert shown["columns"] == HEADER and shown["data"] == [*ROWS, ["step", step / 4, step]]
+    pictures = sorted((run / "files" / "media" / "images" / "eval").iterdir())
+    for step, picture in zip((1, 2), pictures, strict=True):
+        assert np.array_equal(decoded(picture.read_bytes()), PIXELS + step)
+
+
+@pytest.mark.slow
+def test_wandb_does_not_get_again_what_an_earlier_run_has_shown(tmp_path: Path) -> None:
+    show(tmp_path, range(2), backend="wandb")
+    show(tmp_path, range(1, 3), resume_step=1, backend="wandb")
+    steps = []
+    for run in sorted((tmp_path / "wandb").glob("offline-run-*/*.wandb")):
+        steps += [row["step"] for row in wandb_history(run) if "table-file" in str(row)]
+    assert steps == [0, 1, 2]
 
 
 if __name__ == "__main__":
