@@ -52,11 +52,16 @@ def red_light(motion: Motion) -> Tensor | None:
     moves = (front[..., 1:, :] - front[..., :-1, :]).norm(dim=-1) > DRIVING_SPEED * STEP_SECONDS
     moves &= there[:, 1:] & there[:, :-1]
     at_red, at_other = torch.zeros_like(moves), torch.zeros_like(moves)
+    # Few ways lead past a given light: most are told apart by the box around them.
+    low, high = front.amin(2) - LANE_WIDTH / 2, front.amax(2) + LANE_WIDTH / 2
     steps = slice(NOW + 1, NOW + 1 + moves.shape[-1])
-    for point, along, listed, red in lines:
-        crossed = _crosses(front, heading, point[steps], along[steps]) & moves & listed[steps]
-        at_red |= crossed & red[steps]
-        at_other |= crossed & ~red[steps]
+    for point, along, listed, red in (StopLine(*(value[steps] for value in line)) for line in lines):
+        if not listed.any():
+            continue
+        near = ((low <= point[listed].amax(0)) & (high >= point[listed].amin(0))).all(-1)
+        crossed = _crosses(front[near], heading[near], point, along) & moves[near] & listed
+        at_red[near] |= crossed & red
+        at_other[near] |= crossed & ~red
     found = motion.controlled.new_zeros(motion.poses.shape[:2])
     found[:, driver] = (at_red & ~at_other).any(-1)
     return found
@@ -80,13 +85,13 @@ def _crosses(front: Tensor, heading: Tensor, point: Tensor, along: Tensor) -> Te
     """Steps that end beyond a stop line and began before it.
 
     Args:
-        front: ``[K, E, T + 1, 2]`` [m].
-        heading: ``[K, E, T + 1, 2]``, unit vectors.
+        front: ``[n, T + 1, 2]`` [m].
+        heading: ``[n, T + 1, 2]``, unit vectors.
         point: ``[T, 2]``, middle of the line [m].
         along: ``[T, 2]``, unit vectors.
 
     Returns:
-        ``[K, E, T]`` bool.
+        ``[n, T]`` bool.
     """
     before, after = front[..., :-1, :] - point, front[..., 1:, :] - point
     ahead_before, ahead_after = (before * along).sum(-1), (after * along).sum(-1)

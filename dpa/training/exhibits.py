@@ -67,13 +67,13 @@ def as_table(name: str, header: Sequence[str], rows: Sequence[Sequence[Any]]) ->
 
 
 def as_markdown(table: Table) -> str:
-    """A table as Markdown; what is not known is a dash.
+    r"""A table as Markdown; what is not known is a dash.
 
     Examples:
         >>> print(as_markdown(Table("t", ["a", "b"], [["x|y", None]])))
         | a | b |
         | --- | --- |
-        | x\\|y | – |
+        | x\|y | – |
     """
     lines = [table.header, ["---"] * len(table.header), *table.rows]
     return "\n".join(f"| {' | '.join(map(_markdown_cell, line))} |" for line in lines)
