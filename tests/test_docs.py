@@ -22,6 +22,7 @@ from recipes.benchmark.__main__ import make_parser as benchmark_parser
 from recipes.losses import LOSSES
 from recipes.models import TOKENIZERS
 from recipes.plan import make_parser as plan_parser
+from recipes.report import make_parser as report_parser
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 CONFIG = REPOSITORY / "recipes" / "config"
@@ -124,6 +125,8 @@ def extra_configurations(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+PLAIN = ("recipes.benchmark", "recipes.plan", "recipes.report")
+"""Recipes whose arguments are no options of a configuration."""
 BENCHMARKS = [command for command in COMMANDS if command.startswith("recipes.benchmark ")]
 
 
@@ -137,9 +140,14 @@ def test_a_plan_takes_the_options_that_a_command_gives(command: str) -> None:
     assert plan_parser().parse_args(shlex.split(command)[1:]).rollout.suffix == ".json"
 
 
+@pytest.mark.parametrize("command", [command for command in COMMANDS if command.startswith("recipes.report ")])
+def test_a_report_takes_the_arguments_that_a_command_gives(command: str) -> None:
+    assert report_parser().parse_args(shlex.split(command)[1:]).out
+
+
 @pytest.mark.parametrize(
     "command",
-    [c for c in COMMANDS if c.startswith("recipes.") and not c.startswith(("recipes.benchmark", "recipes.plan"))],
+    [c for c in COMMANDS if c.startswith("recipes.") and not c.startswith(PLAIN)],
 )
 def test_a_recipe_takes_the_options_that_a_command_gives(command: str, extra_configurations: Path) -> None:
     module, *arguments = shlex.split(command)
