@@ -1,26 +1,16 @@
-"""What a comparison found, for people: statistics, tables, figures and one page with playable scenes.
+"""What experiments found, for people: statistics, tables, figures and one page with playable scenes.
 
-Everything here works on plain data (dicts that JSON can hold, tensors, scenes); nothing knows a policy or an
-environment. The shape of the ``comparison`` dict that recipes write and this package reads is::
+Everything here works on plain data (dicts that JSON can hold, tensors, scenes) and on the files of a study; nothing
+knows a policy or an environment. A study is a folder RUNS::
 
-    {
-        "metric": "2024",                            # configuration of the realism metric
-        "scenes": {"train": 100, "tune": 24, "eval": 54, "source": "..."},
-        "rows": [                                    # one for each method, seed and top_p
-            {"method", "seed", "top_p", "n_scenes", "kinematic", "interactive", "map_based", "realism", "min_ade",
-             "collision_rate", "offroad_rate", "preference_distance", "pair_accuracy"},
-        ],
-        "paired": [                                  # one for each method (and top_p) that is compared
-            {"method", "realism_difference", "ci95": [low, high], "over", "n_seeds"},
-        ],
-        "per_scene": {method: {seed: [realism of each evaluation scene]}},
-        "seeds": [0, 1, 2],
-        "stages": {"pretrain": seconds, ...},
-        "wall_seconds": 3600.0,
-        "versions": {"torch": "...", ...},
-        "command": "python -m recipes.compare ...",
-    }
+    experiments/<name>.json      what an experiment found: dpa.report.experiment.read_experiment
+    seed_<n>/<method>/           scalars of a training run, and the evaluations behind the rows
+    seed_<n>/preferences_*/      ranked rollouts of the reference of a seed
+    stages.json                  seconds and jobs of each stage
+    players.json                 scenes and rollouts to play: dpa.report.player.pack_players
+    validity/, sensitivity/, discriminator/    summary.json and pictures of a study of rankings
 
-A number that was not measured is None, never NaN. The reference's rows carry the method name
+:func:`dpa.report.study.read_study` reads it and :func:`dpa.report.page.write_study` makes one page of it. In a row, a
+number that was not measured is None, never NaN. The reference's rows carry the method name
 :data:`~dpa.report.table.REFERENCE`.
 """

@@ -171,6 +171,7 @@ def discriminator_section(found: Mapping[str, Any]) -> Section:
     head = ["within a scene", *kinds]
     rows = [[labels[q], *(_cell(values[kind]) for kind in kinds)] for q, values in correlation.items()]
     chance = {name: _plain(value) for name, value in found["auc"].items()}
+    held_out = [f"{name} {number(run['best']['held_out_auc'], 3)}" for name, run in found["policies"].items()]
     parts = [
         element("p", "What does a discriminator of logs and rollouts rank rollouts by?", class_="question"),
         gallery(charts),
@@ -178,7 +179,8 @@ def discriminator_section(found: Mapping[str, Any]) -> Section:
         hint(
             "How much more by smoothness than by the preference distance: "
             f"{_text(found['smoothness_minus_distance'])}. Share of rollouts below the log: by the discriminator "
-            f"{chance['discriminator']}, by jerk alone {chance['jerk']}."
+            f"{chance['discriminator']}, by jerk alone {chance['jerk']}. "
+            f"Held-out AUC for each policy: {', '.join(held_out)}."
         ),
     ]
     return Section("discriminator", "What a discriminator ranks by", joined([*parts, origin("discriminator", found)]))

@@ -201,6 +201,7 @@ def _made(experiment: Experiment) -> Html:
         "date": experiment.date or MISSING,
         "machine": experiment.machine or MISSING,
         "wall time": duration(experiment.wall_seconds),
+        "stages": ", ".join(f"{name} {duration(spent)}" for name, spent in experiment.stages.items()) or MISSING,
         "versions": ", ".join(f"{name} {version}" for name, version in experiment.versions.items()),
     }
     config = json.dumps(experiment.config, indent=2, ensure_ascii=False, allow_nan=False)

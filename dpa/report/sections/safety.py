@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dpa.report.experiment import Comparison, Experiment, decoding_of
+from dpa.report.experiment import Comparison, Experiment, decoding_of, in_words
 from dpa.report.markup import Html, element, hint, joined, table
 from dpa.report.statistics import Interval, paired_bootstrap
 from dpa.report.study import Evaluations
@@ -41,7 +41,10 @@ def safety_table(experiment: Experiment, comparison: Comparison, evaluations: Ev
         for key in measured:
             found = None if mine == base else paired_rate(mine, base, key, evaluations)
             cells.append(joined([number(record.get(key), 3), _change(found)], ""))
-        rows.append([experiment.label(record["method"]), *cells])
+        name = experiment.label(record["method"])
+        if record["method"] == REFERENCE and mine != base:
+            name += f", {in_words(decoding_of(record))}"
+        rows.append([name, *cells])
     return joined(
         [
             element("h3", "Safety"),

@@ -213,6 +213,7 @@ def test_studies_of_rankings_are_figures_and_tables(page: Page) -> None:
         "0.600 [0.550, 0.650]", "0.500 [0.450, 0.550]", "0.100 [0.050, 0.150]", "0.400",
     ]  # fmt: skip
     assert "python -m recipes.sensitivity policies=[a.pt]" in page.text
+    assert "Held-out AUC for each policy: 0 0.910." in page.text
     assert table(page, "within a scene", "discriminator")[1] == ["collision rate", "–", "–", "–", "–"]
 
 
