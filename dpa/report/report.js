@@ -2,7 +2,8 @@
 // Draws the figures of the page, one after the other so that it stays awake, and those of a folded part when it opens.
 (() => {
   const config = {
-    displaylogo: false, responsive: true, showTips: false,
+    displaylogo: false, responsive: true, showTips: false, displayNotifier: false,
+    showSendToCloud: false, plotlyServerURL: "",  // on by default: a button that uploads the figure to a third party
     modeBarButtonsToRemove: ["select2d", "lasso2d", "zoomIn2d", "zoomOut2d", "autoScale2d"],
     toImageButtonOptions: { format: "svg" },
   };

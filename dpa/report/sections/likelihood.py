@@ -108,7 +108,7 @@ def training_section(
     about = hint(
         "Figures 4 and 6 of the paper: negative log-likelihood of ranked rollouts of the tuning scenes along training. "
         f"Thin lines are seeds, thick ones their mean; curves of more than {POINTS} points are averaged over blocks of "
-        "steps. "
+        "steps (seed_N/METHOD/scalars/). "
         "Each figure has a scale of its own."
     )
     return Section("training", "Likelihood along training", joined([about, *parts]))

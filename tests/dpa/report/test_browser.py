@@ -71,6 +71,17 @@ def test_a_point_tells_its_interval_and_seeds_when_it_is_pointed_at(page: Any, r
     assert "3 seeds" in told and "by seed" in told
 
 
+def test_a_figure_can_be_saved_and_never_sent_away(page: Any) -> None:
+    forest = page.locator("#experiment-methods .plot").first
+    forest.hover()
+    buttons = forest.locator(".modebar-btn")
+    titles = buttons.evaluate_all("buttons => buttons.map((button) => button.dataset.title)")
+    assert titles == ["Download plot", "Zoom", "Pan", "Reset axes"]
+    with page.expect_download() as saved:
+        buttons.first.click()
+    assert Path(saved.value.path()).read_text(encoding="utf-8").startswith("<svg")
+
+
 def test_a_tab_shows_its_table_and_hides_the_other(page: Any) -> None:
     own, common = page.locator("#experiment-methods [role=tab]").all()
     panels = page.locator("#experiment-methods [role=tabpanel]")
