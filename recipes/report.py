@@ -36,6 +36,8 @@ def report(runs: Path, out: Path) -> Path:
     """
     study = read_study(runs)
     if out.suffix == ".png":
+        if not study.experiments:
+            raise ValueError(f"{runs} holds no experiments/*.json, and {out.name} is a picture of one; ask for a .html.")
         plot_comparison(next(iter(study.experiments.values())), out)
         return out
     page = out if out.suffix == ".html" else out / "index.html"
