@@ -37,7 +37,7 @@ def report(runs: Path, out: Path) -> Path:
     study = read_study(runs)
     if out.suffix == ".png":
         if not study.experiments:
-            raise ValueError(f"{runs} holds no experiments/*.json, and {out.name} is a picture of one; ask for a .html.")
+            raise ValueError(f"{runs} holds no experiments/*.json, and {out.name} is a picture of one; say page.html.")
         plot_comparison(next(iter(study.experiments.values())), out)
         return out
     page = out if out.suffix == ".html" else out / "index.html"

@@ -21,7 +21,6 @@ from dpa.report.table import REFERENCE, difference
 FONT = 'system-ui, -apple-system, "Segoe UI", Roboto, sans-serif'
 DIGITS = 5
 """Significant digits of a number in a figure."""
-DASHES = ("solid", "dash", "dot")
 ROW_HEIGHT, LEGEND_HEIGHT = 34, 24
 """Of a row of a forest and of a row of a legend [pixels]."""
 

@@ -65,21 +65,19 @@ def element(tag: str, *parts: object, **attributes: str | bool) -> Html:
     return Html(f"<{tag}{''.join(texts)}>{joined(parts, '')}</{tag}>")
 
 
-def table(head: Sequence[object], rows: Iterable[Sequence[object]], *, marked: Iterable[int] = ()) -> Html:
+def table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> Html:
     """A table that scrolls within its box.
 
     Args:
         head: titles of the columns.
         rows: cells; the first of a row names it.
-        marked: indices of rows that stand out.
     """
-    marked = set(marked)
     # A title may wrap between words, so that the table fits a screen; a hyphen is no such place.
     titles = [element("th", Html(html(title).replace("-", "&#8209;")), scope="col") for title in head]
     body = []
-    for place, (name, *cells) in enumerate(rows):
+    for name, *cells in rows:
         texts = [element("th", name, scope="row"), *(element("td", cell) for cell in cells)]
-        body.append(element("tr", *texts, class_="apart" if place in marked else False))
+        body.append(element("tr", *texts))
     content = element("table", element("thead", element("tr", *titles)), element("tbody", joined(body)))
     return element("div", content, class_="wide", tabindex="0")
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from dpa.report.markup import Html, Section, command, element, facts, folded, hint, joined
+from dpa.report.markup import Html, Section, command, element, facts, folded, hint, html, joined
 
 
 def origin(name: str, found: Mapping[str, Any]) -> Html:
@@ -63,4 +63,4 @@ def picture(path: Path) -> Html:
     if not content.startswith(b"\x89PNG"):
         raise ValueError(f"{path} is not a PNG; a page shows PNG pictures.")
     data = base64.b64encode(content).decode("ascii")
-    return element("figure", Html(f'<img alt="{path.stem}" src="data:image/png;base64,{data}">'))
+    return element("figure", Html(f'<img alt="{html(path.stem)}" src="data:image/png;base64,{data}">'))

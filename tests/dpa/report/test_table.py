@@ -78,5 +78,22 @@ def test_a_difference_with_a_top_p_goes_to_that_row(comparison: dict[str, Any]) 
     assert [record["realism_difference"] for record in records[:2]] == [None, 0.005]
 
 
+def test_decodings_that_differ_in_temperature_alone_are_rows_of_their_own() -> None:
+    rows = [
+        {"method": "reference", "seed": 0, "top_p": 0.9, "temperature": temperature, "realism": temperature / 2}
+        for temperature in (1.0, 0.8)
+    ]
+    sharper = {"method": "reference", "top_p": 0.9, "temperature": 0.8, "realism_difference": -0.1, "ci95": [-0.2, 0.0]}
+    records = summarise(rows, [sharper])
+    assert [(record["temperature"], record["realism"]) for record in records] == [(1.0, 0.5), (0.8, 0.4)]
+    assert [record["realism_difference"] for record in records] == [None, -0.1]
+    assert header(records)[1:3] == ["top-p", "temperature"] and cells(records)[1][1:3] == ["0.90", "0.80"]
+
+
+def test_the_temperature_is_not_told_where_it_is_one_everywhere() -> None:
+    records = summarise([{"method": "reference", "top_p": 0.9, "temperature": 1.0, "realism": 0.5}])
+    assert header(records)[1:3] == ["top-p", "seeds"]
+
+
 if __name__ == "__main__":
     pytest.main([__file__])
