@@ -30,6 +30,7 @@ from recipes.jobs import (
     rerank_job,
     runs_of,
 )
+from recipes.logged import log_experiment
 from recipes.methods import levels, read_setups
 from recipes.models import policy_config
 from recipes.pictures import write_players
@@ -75,6 +76,7 @@ def compare(cfg: DictConfig) -> dict[str, Any]:
         write_players(cfg, splits[cfg.experiment.split], chosen.policies, chosen.decodings)
     found = summarise_experiment(cfg, splits, chosen.policies, chosen.decodings, stages.seconds)
     write_json(runs.experiment(cfg.experiment.name), found)
+    log_experiment(cfg, found)
     return found
 
 
@@ -107,10 +109,8 @@ def train_policies(cfg: DictConfig, stages: Stages) -> None:
     stages.run("collect", collect_job, cfg, [(seed, split, REFERENCE) for seed in seeds for split in splits])
     for level in levels(setups):
         needed = [setups[method] for method in level]
-        sources = {policy for setup in needed for policy in (setup.start, setup.expert) if policy is not None}
-        stages.run(
-            "collect", collect_job, cfg, [(seed, "train", source) for seed in seeds for source in sorted(sources)]
-        )
+        sources = sorted({setup.start for setup in needed} | {setup.expert for setup in needed if setup.expert})
+        stages.run("collect", collect_job, cfg, [(seed, "train", source) for seed in seeds for source in sources])
         again = sorted({(setup.start, setup.ranking) for setup in needed if setup.ranking is not None})
         stages.run("rank", rerank_job, cfg, [(seed, *each) for seed in seeds for each in again])
         stages.run("align", align_job, cfg, [(seed, method) for seed in seeds for method in level])

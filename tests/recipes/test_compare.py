@@ -66,6 +66,16 @@ def test_a_reader_finds_the_values_of_every_scene_behind_a_number(finished: Path
         assert behind["options"]["seed"] == row["seed"] and behind["options"]["decoding"]["top_p"] == row["top_p"]
 
 
+def test_tables_and_picture_are_in_the_logs_of_the_experiment(finished: Path) -> None:
+    folder = finished / "experiments/methods"
+    rows = (folder / "tables/own_best/methods/0.csv").read_text().splitlines()
+    assert rows[0].startswith("method,") and [row.split(",")[0] for row in rows[1:]] == ["reference", *METHODS]
+    assert (folder / "pictures/own_best/differences/0.png").read_bytes().startswith(b"\x89PNG")
+    logged = float((folder / "scalars/common/realism/dpa_omf.csv").read_text().split(",")[1])
+    (row,) = [row for row in experiment(finished)["rows"] if row["method"] == "dpa_omf"]
+    assert logged == pytest.approx(row["realism"])
+
+
 def test_likelihoods_are_followed_along_the_alignment_of_every_method(finished: Path) -> None:
     for method, folders in experiment(finished)["curves"].items():
         rows = (finished / folders["0"] / "scalars/tune/nll_preferred.csv").read_text().splitlines()
