@@ -40,7 +40,7 @@ from recipes.rankings import build_distance
 from recipes.rolled import Rolled, rolled
 from recipes.scenes import fingerprint, open_splits
 from recipes.spurious import QUANTITIES, RANKINGS, summarise
-from recipes.study import as_json, policies_of, shown, study_policy
+from recipes.study import as_json, how_made, policies_of, shown, study_policy
 
 FIGURES = ("realism", "kinematic", "interactive", "map_based")
 RANDOM_GROUPS = 8
@@ -237,24 +237,20 @@ def main(cfg: DictConfig) -> None:
         measured[name] = study_policy(cfg, scenes, path, measure, decided_by, name)
     found, folder = summarise(measured), Path(cfg.output)
     plot_discriminator(found, folder / "discriminator.png")
-    write_json(folder / "summary.json", summary_json(found, training, cfg, len(scenes)))
+    made = how_made(cfg, "discriminator", scenes, measured)
+    write_json(folder / "summary.json", summary_json(found, training) | {"made": made})
     _print(found, training, len(scenes), cfg)
     print(f"numbers of every scene, summary and figure: {folder}")
 
 
-def summary_json(found: dict[str, Any], training: dict[str, dict], cfg: DictConfig, num_scenes: int) -> dict[str, Any]:
-    """All that a report needs: what was found, and the training of each policy's discriminator."""
+def summary_json(found: dict[str, Any], training: dict[str, dict]) -> dict[str, Any]:
+    """What was found, and how the training of each policy's discriminator went, for a report."""
     return as_json(found) | {
         "labels": QUANTITIES,
         "policies": {
             name: {"best": done["best"], "curve": done["curve"], "training_scenes": done["scenes"]}
             for name, done in training.items()
         },
-        "scenes": num_scenes,
-        "num_rollouts": cfg.num_rollouts,
-        "sight": plain(cfg.sight),
-        "metric": cfg.metric,
-        "seed": cfg.seed,
     }
 
 
