@@ -9,6 +9,7 @@ Methods differ in one YAML each: dpa_omf, dpa_adef, sft_best_oa, sft_best_ade, a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import hydra
@@ -25,14 +26,17 @@ from dpa.training.seeding import seed_everything
 from envs.progress import message
 from envs.seeding import make_generator
 from envs.store import SceneStore
-from recipes.candidates import make_candidates
-from recipes.cli import CONFIG, check_steps, finished, finite, plain, ranked_recipe, write_json
+from recipes.candidates import Candidates, make_candidates
+from recipes.cli import CONFIG, check_steps, deciding, finished, finite, plain, ranked_recipe, write_json
 from recipes.draws import parts_of
 from recipes.losses import check_fit, make_loss
 from recipes.models import open_policy, weights_digest, write_policy
 from recipes.rankings import open_preferences
-from recipes.scenes import open_splits
+from recipes.scenes import fingerprint, open_splits
 from recipes.watch import Look, Watch
+
+OBSERVING = ("checkpoint_interval", "max_rows", "watch_interval", "watch_scenes", "watch_pairs")
+"""Options of the section ``alignment`` that change nothing about the policy."""
 
 
 def align(
@@ -47,6 +51,7 @@ def align(
     *,
     expert: Path | None = None,
     watch: Watch | None = None,
+    among: Sequence[int] | None = None,
 ) -> Path:
     """Fine-tune a policy with one method.
 
@@ -61,6 +66,7 @@ def align(
         ranks: that train together; the scenes of a step are theirs together.
         expert: folder of the store with the rollouts of an expert (``data.kind: expert``).
         watch: what is looked at every ``alignment.watch_interval`` steps, for the curves ``tune/*``.
+        among: indices of the scenes to learn from; by default all that the preferences are of.
 
     Returns:
         The file of the aligned policy.
@@ -75,10 +81,12 @@ def align(
     model, context, config = open_policy(policy, device)
     store = open_preferences(preferences, scenes, model, policy)
     played = None if expert is None else PreferenceStore(expert)
+    learnt = sorted(set(store.scenes.tolist()) & set(store.scenes.tolist() if among is None else among))
     decided_by = {
         "data": plain(method.data),
         "loss": plain(method.loss),
-        "alignment": plain(options),
+        "alignment": deciding(options, *OBSERVING),
+        "scenes": fingerprint(scenes.subset(learnt)),
         "seed": seed,
         "reference": weights_digest(model),
         "ranking": store.provenance.ranking,
@@ -87,13 +95,9 @@ def align(
     if ranks.agree(finished(result, decided_by) is not None and path.is_file(), "finished =", folder):
         return path
     seed_everything(seed)
-    candidates = make_candidates(method.data, store, scenes, context, model.tokenizer.cpu(), seed, played)
-    counts = {len(group.preferred) for group in candidates}
-    if len(counts) > 1 and min(counts) < options.pairs_per_scene:
-        raise ValueError(
-            f"alignment.pairs_per_scene={options.pairs_per_scene} and scenes have {min(counts)} to {max(counts)} pairs "
-            f"after method.data.margin and rankings_per_scene; say alignment.pairs_per_scene={min(counts)}."
-        )
+    candidates = make_candidates(method.data, store, scenes, context, model.tokenizer.cpu(), seed, played, learnt)
+    check_enough(candidates, options.pairs_per_scene)
+    look = Look(watch, context, model.to(device), options) if watch is not None and ranks.main else None
     loss = ranks.wrap(make_loss(method.loss, model.to(device).train()))
     optimizer = make_optimizer(model, options.lr, options.weight_decay)
     schedule = make_schedule(optimizer, options.steps, options.warmup)
@@ -110,12 +114,11 @@ def align(
         description=method.name,
         ranks=ranks,
     )
-    look = Look(watch, context, model, options) if watch is not None and ranks.main else None
     described = {"method": method.name, "seed": seed, "options": decided_by}
     with run:
+        if look is not None and run.first_step == 0:
+            run.log(look(device), 0)
         for step in run.steps():
-            if look is not None and step % options.watch_interval == 0:
-                run.log(look(device), step)
             draw = make_generator(seed, "pairs", step)
             groups = [candidates[i] for i in order(step)]
             ranks.seed_dropout(seed, step)
@@ -124,16 +127,31 @@ def align(
             if (warning := saturation(step, losses)) and ranks.main:
                 message(warning)
             run.log({f"train/{key}": value for key, value in losses.items()} | {"train/gradient_norm": norm})
-            if ranks.main and step + 1 in options.snapshots:
-                write_policy(folder / f"step_{step + 1}" / "policy.pt", model, config, described | {"step": step + 1})
-        if look is not None:
-            run.log(look(device), options.steps)
+            done = step + 1
+            if look is not None and (done % options.watch_interval == 0 or done == options.steps):
+                run.log(look(device))
+            if ranks.main and done in options.snapshots:
+                write_policy(folder / f"step_{done}" / "policy.pt", model, config, described | {"step": done})
     if ranks.main:
         write_policy(path, model, config, described)
         last = {name: finite(curve["value"][-1]) for name, curve in read_curves(folder).items()}
         write_json(result, {"options": decided_by, "policy": str(path), "last_step": last})
     ranks.wait()
     return path
+
+
+def check_enough(candidates: Candidates, pairs_per_scene: int) -> None:
+    """Refuse scenes that give a step different numbers of pairs: they do not fit in one batch.
+
+    Raises:
+        ValueError: some scenes have fewer pairs than a step takes, and others have more.
+    """
+    counts = {len(group.preferred) for group in candidates}
+    if len(counts) > 1 and min(counts) < pairs_per_scene:
+        raise ValueError(
+            f"alignment.pairs_per_scene={pairs_per_scene} and scenes have {min(counts)} to {max(counts)} pairs after "
+            f"method.data.margin and rankings_per_scene; say alignment.pairs_per_scene={min(counts)}."
+        )
 
 
 @hydra.main(**CONFIG, config_name="align")

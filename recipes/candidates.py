@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import NamedTuple
 
 import torch
@@ -82,8 +83,9 @@ def make_candidates(
     tokenizer: MotionTokenizer,
     seed: int,
     expert: PreferenceStore | None = None,
+    among: Collection[int] | None = None,
 ) -> Candidates:
-    """Candidates of every scene of a store.
+    """Candidates of the scenes of a store.
 
     Args:
         data: ``kind`` (one of :data:`SIDES`), ``rank_by`` (``distance`` or ``ade``; for :data:`RANKED` ones) and
@@ -100,6 +102,7 @@ def make_candidates(
         tokenizer: for the tokens of logs.
         seed: of everything that is drawn.
         expert: rollouts of an expert in the same scenes and tokens, the preferred side of ``kind: expert``.
+        among: indices of the scenes to take; all by default.
 
     Returns:
         Scenes that no pair is left of, or no token, are not among them.
@@ -116,7 +119,7 @@ def make_candidates(
     chosen = _choose(data, store, seed)
     groups = []
     for row, scene in enumerate(store.scenes.tolist()):
-        if not len(chosen[row].preferred):
+        if not len(chosen[row].preferred) or (among is not None and scene not in among):
             continue
         context = contexts[scene]
         ranked = store.read([row], num_agents=len(context.kind))[0]
@@ -185,6 +188,11 @@ def _choose_pairs(data: DictConfig, distance: Tensor, seed: int) -> list[Chosen]
             "distance; lower it."
         )
     if data.rankings_per_scene is not None:
+        if data.rankings_per_scene > preferred.shape[1]:
+            raise ValueError(
+                f"method.data.rankings_per_scene={data.rankings_per_scene} and a scene has {preferred.shape[1]} pairs; "
+                "lower it, take more of the rollouts (method.data.num), or collect more of them."
+            )
         kept = thin_out(kept, data.rankings_per_scene, make_generator(seed, "rankings"))
     return [Chosen(near[rows], far[rows]) for near, far, rows in zip(preferred, unpreferred, kept, strict=True)]
 

@@ -120,6 +120,11 @@ def plain(section: DictConfig) -> dict[str, Any]:
     return OmegaConf.to_container(section, resolve=True, throw_on_missing=True)
 
 
+def deciding(section: DictConfig, *without: str) -> dict[str, Any]:
+    """A section without the options that change how a result is made and not the result."""
+    return {key: value for key, value in plain(section).items() if key not in without}
+
+
 def build(target: Callable[..., Any], section: DictConfig, name: str, *args: Any, **fixed: Any) -> Any:
     """Call ``target`` with a section of the configuration as keyword arguments.
 

@@ -19,6 +19,7 @@ from omegaconf import DictConfig
 from dpa.policy import Decoding
 from dpa.policy.actor import check_precision
 from dpa.preferences import PreferenceStore, PreferenceWriter, Provenance, data_card
+from dpa.ranking import Distance
 from dpa.ranking.transform import RankRollouts
 from dpa.rollout import Workers, make_collector
 from dpa.rollout.collector import rows_within
@@ -37,6 +38,7 @@ def collect(
     seed: int,
     folder: Path,
     indices: Sequence[int] | None = None,
+    distance: Distance | None = None,
 ) -> PreferenceStore:
     """Fill a preference store with ranked rollouts of the scenes that it lacks.
 
@@ -47,11 +49,12 @@ def collect(
         seed: of the sampling.
         folder: of the store.
         indices: scenes to roll out; all by default.
+        distance: that ranks; by default the one that the options name.
     """
     indices = range(len(scenes)) if indices is None else indices
     options = cfg.collection
     model, context, _ = open_policy(policy, cfg.device)
-    distance = build_distance(options.ranking, "collection.ranking")
+    distance = distance or build_distance(options.ranking, "collection.ranking")
     # What is wrong with an option is told before a store is begun with it.
     decoding = build(Decoding, options.decoding, "collection.decoding")
     workers = build(Workers, options.workers, "collection.workers")

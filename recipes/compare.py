@@ -16,11 +16,12 @@ import sys
 from typing import Any, NamedTuple
 
 import hydra
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from dpa.policy import Decoding
 from dpa.report.table import REFERENCE, print_table
-from recipes.cli import CONFIG, check_steps, recipe, write_json
+from recipes.check import check_experiment
+from recipes.cli import CONFIG, recipe, write_json
 from recipes.jobs import (
     align_job,
     collect_job,
@@ -31,20 +32,15 @@ from recipes.jobs import (
     runs_of,
 )
 from recipes.logged import log_experiment
-from recipes.methods import levels, read_setups
-from recipes.models import policy_config
+from recipes.methods import levels, read_setups, setup_of
 from recipes.pictures import write_players
 from recipes.pool import Workers
+from recipes.provenance import provenance
 from recipes.report import report
 from recipes.runs import SNAPSHOT
 from recipes.scenes import open_splits
-from recipes.stages import Stages
+from recipes.stages import Stages, alone_in
 from recipes.summary import summarise_experiment
-
-SPLITS = ("tune", "eval")
-"""What an experiment can report."""
-CHECKPOINTS = ("last", "select", "all")
-"""What becomes of the snapshots of an alignment: there are none, one of them may be chosen, or each is shown."""
 
 
 class Chosen(NamedTuple):
@@ -66,39 +62,19 @@ def compare(cfg: DictConfig) -> dict[str, Any]:
         ValueError: options that do not fit, before any work.
     """
     check_experiment(cfg)
-    splits, runs = open_splits(cfg.scenes), runs_of(cfg)
-    with Workers(cfg.workers, cfg.threads) as workers:
-        stages = Stages(workers, runs.stages)
-        train_policies(cfg, stages)
-        chosen = choose(cfg, stages)
-        measure(cfg, stages, chosen)
-    if cfg.pictures.scenes:
-        write_players(cfg, splits[cfg.experiment.split], chosen.policies, chosen.decodings)
-    found = summarise_experiment(cfg, splits, chosen.policies, chosen.decodings, stages.seconds)
-    write_json(runs.experiment(cfg.experiment.name), found)
-    log_experiment(cfg, found)
+    splits, runs, made = open_splits(cfg.scenes), runs_of(cfg), provenance("compare", cfg.device)
+    with alone_in(runs.root):
+        with Workers(cfg.workers, cfg.threads) as workers:
+            stages = Stages(workers, runs.stages)
+            train_policies(cfg, stages)
+            chosen = choose(cfg, stages)
+            measure(cfg, stages, chosen)
+        if cfg.pictures.scenes:
+            write_players(cfg, splits[cfg.experiment.split], chosen.policies, chosen.decodings)
+        found = summarise_experiment(cfg, splits, chosen.policies, chosen.decodings, stages.seconds) | made
+        write_json(runs.experiment(cfg.experiment.name), found)
+        log_experiment(cfg, found)
     return found
-
-
-def check_experiment(cfg: DictConfig) -> None:
-    """A wrong option is told before hours of work."""
-    for section in ("pretraining", "alignment"):
-        check_steps(cfg[section], section)
-    policy_config(cfg.model)
-    read_setups(cfg)
-    if cfg.experiment.split not in SPLITS:
-        raise ValueError(f"experiment.split must be one of {', '.join(SPLITS)}, got {cfg.experiment.split!r}.")
-    if cfg.experiment.checkpoints not in CHECKPOINTS:
-        raise ValueError(
-            f"experiment.checkpoints must be one of {', '.join(CHECKPOINTS)}, got {cfg.experiment.checkpoints!r}."
-        )
-    if cfg.experiment.checkpoints != "last" and not cfg.alignment.snapshots:
-        raise ValueError(
-            f"experiment.checkpoints={cfg.experiment.checkpoints} needs checkpoints: say for example "
-            f"alignment.snapshots=[{cfg.alignment.steps // 2}]."
-        )
-    if list(cfg.decoding.common) not in [list(each) for each in cfg.decoding.grid]:
-        raise ValueError(f"decoding.common={list(cfg.decoding.common)} must be one of decoding.grid.")
 
 
 def train_policies(cfg: DictConfig, stages: Stages) -> None:
@@ -127,10 +103,9 @@ def choose(cfg: DictConfig, stages: Stages) -> Chosen:
         policies |= {method: [*snapshots_of(cfg, method), method] for method in cfg.methods}
 
     def tune(wanted: dict[str, list[tuple[str, Decoding]]]) -> None:
-        jobs = {
-            (seed, policy, "tune", *spec(each)) for runs in wanted.values() for policy, each in runs for seed in seeds
-        }
-        stages.run("tune", evaluate_job, cfg, sorted(jobs))
+        runs = {run for of_method in wanted.values() for run in of_method}
+        jobs = sorted((seed, policy, "tune", *spec(decoding)) for policy, decoding in runs for seed in seeds)
+        stages.run("tune", evaluate_job, cfg, jobs)
 
     def best(runs: list[tuple[str, Decoding]]) -> tuple[str, Decoding]:
         return max(runs, key=lambda run: tuning_realism(cfg, *run)) if len(runs) > 1 else runs[0]
@@ -169,10 +144,8 @@ def shown_policies(cfg: DictConfig) -> list[str]:
 
 def snapshots_of(cfg: DictConfig, method: str) -> list[str]:
     """Names of the snapshots of a method."""
-    setup = read_setups(cfg)[method]
-    steps = setup.alignment.get("steps", cfg.alignment.steps)
-    snapshots = setup.alignment.get("snapshots", cfg.alignment.snapshots)
-    return [f"{method}{SNAPSHOT}{step}" for step in snapshots if step < steps]
+    options = OmegaConf.merge(cfg.alignment, setup_of(cfg, method).changes(cfg.alignment))
+    return [f"{method}{SNAPSHOT}{step}" for step in options.snapshots if step < options.steps]
 
 
 def decodings(cfg: DictConfig) -> list[Decoding]:

@@ -24,7 +24,7 @@ from dpa.safety import MEASURES, safety
 from envs.progress import progress
 from envs.scene import CURRENT_STEP
 from envs.store import SceneStore
-from recipes.cli import CONFIG, build, finished, finite, plain, recipe, write_json
+from recipes.cli import CONFIG, build, deciding, finished, finite, recipe, write_json
 from recipes.models import open_policy, weights_digest
 from recipes.partial import PartialResult
 from recipes.rankings import build_distance
@@ -75,11 +75,12 @@ def evaluate(
     """
     options = cfg.evaluation
     model, context, _ = open_policy(policy, cfg.device)
+    distance = build_distance(cfg.collection.ranking, "collection.ranking")
     decided_by = {
         "policy": weights_digest(model),
         "scenes": fingerprint(scenes),
-        "evaluation": plain(options),
-        "ranking": plain(cfg.collection.ranking),
+        "evaluation": deciding(options, "memory") | {"metric": str(options.metric)},
+        "ranking": distance.describe(),
         "decoding": asdict(decoding),
         "seed": seed,
     }
@@ -87,7 +88,6 @@ def evaluate(
     submission = None if open_submission is None else open_submission(scenes.scene_ids, decided_by)
     if done is not None and (submission is None or submission.finished):
         return done
-    distance = build_distance(cfg.collection.ranking, "collection.ranking")
     partial = PartialResult(path, decided_by)
     scored = partial.read()
     # A scene is done once it is scored and, where a submission is written, in there as well.
@@ -108,7 +108,7 @@ def evaluate(
             device=cfg.device,
         )
         for each in rolled(batches, scenes, options.num_rollouts, ready):
-            scored[each.index] = score_scene(each, distance, options.metric)
+            scored[each.index] = score_scene(each, distance, str(options.metric))
             partial.add({each.index: scored[each.index]})
             if submission is not None:
                 submission.add(each.index, each.scene, each.trajectories, each.controlled)

@@ -1,4 +1,7 @@
-"""The jobs of a study, each a function of the configuration and of what names it, so that any worker can run it."""
+"""The jobs of a study, each a function of the configuration and of what names it, so that any worker can run it.
+
+A job may give the seconds that it spent for another stage of the account.
+"""
 
 from __future__ import annotations
 
@@ -9,20 +12,20 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from dpa.policy import Decoding
-from dpa.preferences import PreferenceStore
 from dpa.report.table import REFERENCE
 from envs.seeding import make_generator
 from recipes.align import align
-from recipes.cli import build, finished, finite, write_json
+from recipes.cli import finished, finite, write_json
 from recipes.collect import collect
 from recipes.evaluate import evaluate
 from recipes.likelihoods import PROBED, divergence, make_probes, probe
-from recipes.methods import Setup
+from recipes.methods import setup_of
 from recipes.models import open_policy, weights_digest
 from recipes.pretrain import pretrain
+from recipes.rankings import TimedDistance, build_distance, open_ranked_scenes
 from recipes.rerank import rerank
 from recipes.runs import RunFolder
-from recipes.scenes import open_splits
+from recipes.scenes import fingerprint, open_splits
 from recipes.watch import Watch
 
 
@@ -31,11 +34,13 @@ def pretrain_job(cfg: DictConfig, seed: int) -> None:
     pretrain(cfg, open_splits(cfg.scenes), seed, runs_of(cfg).training(seed, REFERENCE))
 
 
-def collect_job(cfg: DictConfig, seed: int, split: str, source: str) -> None:
-    """Ranked rollouts of one policy."""
+def collect_job(cfg: DictConfig, seed: int, split: str, source: str) -> dict[str, float]:
+    """Ranked rollouts of one policy; gives the seconds of their ranking, where it is done in this process."""
     runs, scenes = runs_of(cfg), open_splits(cfg.scenes)[split]
     indices = learnt_from(cfg, len(scenes)) if split == "train" else None
-    collect(cfg, scenes, runs.policy(seed, source), seed, runs.preferences(seed, split, source), indices)
+    distance = TimedDistance(build_distance(cfg.collection.ranking, "collection.ranking"))
+    collect(cfg, scenes, runs.policy(seed, source), seed, runs.preferences(seed, split, source), indices, distance)
+    return {"rank": distance.seconds}
 
 
 def learnt_from(cfg: DictConfig, num_scenes: int) -> list[int] | None:
@@ -58,7 +63,7 @@ def align_job(cfg: DictConfig, seed: int, method: str) -> None:
     """One aligned policy."""
     runs, splits, setup = runs_of(cfg), open_splits(cfg.scenes), setup_of(cfg, method)
     align(
-        OmegaConf.merge(cfg, {"alignment": setup.alignment}),
+        OmegaConf.merge(cfg, {"alignment": setup.changes(cfg.alignment)}),
         cfg.methods[method],
         splits.train,
         runs.policy(seed, setup.start),
@@ -67,6 +72,7 @@ def align_job(cfg: DictConfig, seed: int, method: str) -> None:
         runs.training(seed, method),
         expert=None if setup.expert is None else runs.preferences(seed, "train", setup.expert),
         watch=Watch(splits.tune, runs.preferences(seed, "tune")),
+        among=learnt_from(cfg, len(splits.train)),
     )
 
 
@@ -81,13 +87,14 @@ def evaluate_job(cfg: DictConfig, seed: int, policy: str, split: str, top_p: flo
 def likelihood_job(cfg: DictConfig, seed: int, policy: str, split: str) -> None:
     """How likely logs and the reference's rollouts of a split are, and the drift from the reference."""
     runs, scenes = runs_of(cfg), open_splits(cfg.scenes)[split]
-    path, store = runs.likelihood(seed, policy, split), PreferenceStore(runs.preferences(seed, split))
+    path, store = runs.likelihood(seed, policy, split), open_ranked_scenes(runs.preferences(seed, split), scenes)
     model, options, _ = open_policy(runs.policy(seed, policy), cfg.device)
     reference, _, _ = open_policy(runs.policy(seed, REFERENCE), cfg.device)
-    pairs = store.provenance.num_rollouts // 4
+    pairs = max(1, store.provenance.num_rollouts // 4)
     decided_by = {
         "policy": weights_digest(model),
         "reference": weights_digest(reference),
+        "scenes": fingerprint(scenes),
         "pairs": pairs,
         "rollouts": cfg.drift_rollouts,
         "ranking": store.provenance.ranking,
@@ -96,25 +103,22 @@ def likelihood_job(cfg: DictConfig, seed: int, policy: str, split: str) -> None:
     if finished(path, decided_by) is not None:
         return
     probes = make_probes(store, scenes, options, model.tokenizer.cpu(), pairs)
+    if len(probes) != len(scenes):
+        raise ValueError(
+            f"{store.folder} holds {len(probes)} of {len(scenes)} scenes; run the same command again to fill it."
+        )
     found = probe(model.to(cfg.device), probes, cfg.device)
-    per_scene = {name: [finite(each[name]) for each in found] for name in PROBED}
-    per_scene["kl"] = divergence(
-        model, reference, scenes, options, num_rollouts=cfg.drift_rollouts, seed=seed, device=cfg.device
-    )
-    mean = {name: math.fsum(known) / len(known) for name, known in _known(per_scene).items()}
-    ids = [scenes.scene_ids[index] for index in store.scenes.tolist()]
-    write_json(path, {"options": decided_by, "mean": mean, "scenes": ids, "per_scene": per_scene})
+    drift = divergence(model, reference, scenes, options, num_rollouts=cfg.drift_rollouts, seed=seed, device=cfg.device)
+    per_scene = {name: [finite(each[name]) for each in found] for name in PROBED} | {"kl": list(map(finite, drift))}
+    mean = {name: _mean(values) for name, values in per_scene.items()}
+    write_json(path, {"options": decided_by, "mean": mean, "scenes": scenes.scene_ids, "per_scene": per_scene})
 
 
-def _known(per_scene: dict[str, list[float | None]]) -> dict[str, list[float]]:
-    return {name: [value for value in values if value is not None] for name, values in per_scene.items()}
+def _mean(values: list[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return math.fsum(known) / len(known) if known else None
 
 
 def runs_of(cfg: DictConfig) -> RunFolder:
     """The folder of the study."""
     return RunFolder(Path(cfg.output))
-
-
-def setup_of(cfg: DictConfig, method: str) -> Setup:
-    """How one method hangs together with the others."""
-    return build(Setup, cfg.experiment.setup.get(method) or OmegaConf.create({}), f"experiment.setup.{method}")

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from dpa.losses.network import token_divergence, token_entropy, token_log_prob
 from dpa.policy import ContextOptions, Decoding, MotionLM, SceneContext, collate_contexts
 from dpa.policy.actor import Contexts
 from dpa.preferences import PreferenceStore, nearest_farthest
@@ -81,43 +82,49 @@ def make_probes(
 
 
 @torch.no_grad()
-def probe(model: MotionLM, probes: Iterable[Probe], device: str = "cpu") -> list[dict[str, float]]:
+def probe(
+    model: MotionLM, probes: Iterable[Probe], device: str = "cpu", reference: MotionLM | None = None
+) -> list[dict[str, float]]:
     """Ask a policy about each probe.
 
     Args:
         model: in whatever mode it is; dropout would count.
         probes: of some scenes.
-        device: of the model.
+        device: of the models.
+        reference: what the policy started from, for ``kl``.
 
     Returns:
         For each probe ``pair_accuracy`` (share of pairs whose preferred rollout is the more likely one), the negative
-        log-likelihood per token [nats] of the demonstration, of the preferred and of the unpreferred rollouts, and the
-        ``entropy`` per token [nats] along the rollouts. NaN where the demonstration has no token.
+        log-likelihood per token [nats] of the demonstration, of the preferred and of the unpreferred rollouts, and
+        along the rollouts the ``entropy`` per token and, with a reference, ``kl`` from it per token [nats]. NaN where
+        there is no token.
     """
-    found = []
-    for each in probes:
-        context = collate_contexts([each.context]).to(device)
-        tokens = torch.cat((each.preferred, each.unpreferred))[None].to(device)
-        valid = each.valid[None, None].to(device)
-        log_probs = model(context, tokens, valid).log_softmax(-1)[0]
-        chosen = log_probs.gather(-1, tokens[0, ..., None])[..., 0] * valid[0]
-        near, far = chosen.sum((-1, -2)).chunk(2)
-        count = each.valid.sum()
-        log_tokens = each.demonstration[None, None].to(device)
-        log_valid = each.demonstration_valid.to(device)
-        log = model(context, log_tokens, log_valid[None, None]).log_softmax(-1)
-        log = log.gather(-1, log_tokens[..., None])[0, 0, ..., 0]
-        entropy = -(log_probs.exp() * log_probs).sum(-1)
-        found.append(
-            {
-                "pair_accuracy": (near > far).double().mean().item(),
-                "nll_demonstration": -log[log_valid].mean().item(),
-                "nll_preferred": -near.mean().item() / count.item(),
-                "nll_unpreferred": -far.mean().item() / count.item(),
-                "entropy": ((entropy * valid[0]).sum() / (count * len(tokens[0]))).item(),
-            }
-        )
-    return found
+    return [_probed(model, each, device, reference) for each in probes]
+
+
+def _probed(model: MotionLM, each: Probe, device: str, reference: MotionLM | None) -> dict[str, float]:
+    context = collate_contexts([each.context]).to(device)
+    tokens = torch.cat((each.preferred, each.unpreferred))[None].to(device)
+    valid = each.valid[None, None].to(device)
+    logits = model(context, tokens, valid)
+    near, far = (token_log_prob(logits, tokens)[0] * valid[0]).sum((-1, -2)).chunk(2)
+    log_tokens, log_valid = (value[None, None].to(device) for value in (each.demonstration, each.demonstration_valid))
+    log = token_log_prob(model(context, log_tokens, log_valid), log_tokens)
+    found = {
+        "pair_accuracy": (near > far).double().mean(),
+        "nll_demonstration": -log[log_valid].mean(),
+        "nll_preferred": -near.mean() / valid.sum(),
+        "nll_unpreferred": -far.mean() / valid.sum(),
+        "entropy": _mean(token_entropy(logits), valid),
+    }
+    if reference is not None:
+        found["kl"] = _mean(token_divergence(logits, reference(context, tokens, valid)), valid)
+    return {name: value.item() for name, value in found.items()}
+
+
+def _mean(value: Tensor, valid: Tensor) -> Tensor:
+    """Over the tokens that count; NaN where there are none."""
+    return value[valid.expand_as(value)].mean()
 
 
 def divergence(
@@ -176,6 +183,4 @@ def _kl(model: MotionLM, reference: MotionLM, context: SceneContext, tokens: Ten
     tokens, controlled = tokens[None, :, :num_agents], controlled[:num_agents]
     valid = controlled[None, None, :, None].expand(1, 1, -1, tokens.shape[-1])
     context = collate_contexts([context]).to(tokens.device)
-    log_probs, base = (policy(context, tokens, valid).log_softmax(-1) for policy in (model, reference))
-    per_token = (log_probs.exp() * (log_probs - base)).sum(-1)
-    return per_token[valid.expand_as(per_token)].mean().item()
+    return _mean(token_divergence(*(policy(context, tokens, valid) for policy in (model, reference))), valid).item()

@@ -14,10 +14,9 @@ from dpa.report.figures import plot_comparison
 from dpa.report.table import cells, header, summarise
 from dpa.training.loggers import make_logger
 from recipes.cli import plain
+from recipes.evaluate import SCENE_FIGURES
 from recipes.jobs import runs_of
-
-LOGGED = ("realism", "kinematic", "interactive", "map_based", "min_ade", "collision_rate", "offroad_rate")
-"""Figures that are logged as numbers, means over seeds."""
+from recipes.likelihoods import PROBED
 
 
 def log_experiment(cfg: DictConfig, found: Mapping[str, Any]) -> Path:
@@ -39,8 +38,11 @@ def log_experiment(cfg: DictConfig, found: Mapping[str, Any]) -> Path:
             records = summarise(each["rows"], each["paired"])
             logger.table(f"{name}/methods", header(records), cells(records), 0)
             first = {record["method"]: record for record in reversed(records)}  # the reference's other decodings follow
-            values = {f"{name}/{key}/{method}": record[key] for method, record in first.items() for key in LOGGED}
+            values = {
+                f"{name}/{key}/{method}": record[key] for method, record in first.items() for key in SCENE_FIGURES
+            }
             logger.log({key: value for key, value in values.items() if value is not None}, 0)
+        logger.log(_likelihoods(found), 0)
         with tempfile.TemporaryDirectory() as drawn:
             picture = Path(drawn) / "differences.png"
             plot_comparison(read_experiment(path), picture)
@@ -48,3 +50,14 @@ def log_experiment(cfg: DictConfig, found: Mapping[str, Any]) -> Path:
     finally:
         logger.close()
     return folder
+
+
+def _likelihoods(found: Mapping[str, Any]) -> dict[str, float]:
+    """Pair accuracy, likelihoods, entropy and drift of each method, means over seeds."""
+    means = {}
+    for name in (*PROBED, "kl"):
+        for method in found["methods"]:
+            values = [entry[name] for entry in found["likelihood"] if entry["method"] == method]
+            if values and None not in values:
+                means[f"likelihood/{name}/{method}"] = sum(values) / len(values)
+    return means

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from dpa.report.table import REFERENCE
 from recipes.cli import build
@@ -23,12 +23,25 @@ class Setup:
         expert: method whose rollouts are the preferred ones (``data.kind: expert``).
         ranking: name of the distance, in ``rankings``, that ranks the rollouts again; None keeps the collection's.
         alignment: options of the section ``alignment`` that differ.
+        length: of the alignment, in lengths of that section: a control for rounds.
     """
 
     start: str = REFERENCE
     expert: str | None = None
     ranking: str | None = None
     alignment: Mapping[str, Any] = field(default_factory=dict)
+    length: float = 1.0
+
+    def changes(self, section: DictConfig) -> dict[str, Any]:
+        """What this method changes of the section ``alignment``."""
+        changed = dict(self.alignment)
+        return changed | {"steps": round(self.length * changed.get("steps", section.steps))}
+
+
+def setup_of(cfg: DictConfig, method: str) -> Setup:
+    """The setup of one method."""
+    given = cfg.experiment.setup.get(method)
+    return build(Setup, OmegaConf.create({}) if given is None else given, f"experiment.setup.{method}")
 
 
 def read_setups(cfg: DictConfig) -> dict[str, Setup]:
@@ -47,11 +60,18 @@ def read_setups(cfg: DictConfig) -> dict[str, Setup]:
     for name in (REFERENCE, *(name for name in cfg.methods if SNAPSHOT in name)):
         if name in cfg.methods:
             raise ValueError(f"methods.{name}: {REFERENCE!r} and names with {SNAPSHOT!r} are taken; call it otherwise.")
-    setups = {name: build(Setup, given.get(name) or DictConfig({}), f"experiment.setup.{name}") for name in cfg.methods}
+    setups = {name: setup_of(cfg, name) for name in cfg.methods}
     for name, setup in setups.items():
         for policy in (setup.start, setup.expert or REFERENCE):
             if policy not in (REFERENCE, *cfg.methods):
                 raise ValueError(f"experiment.setup.{name} names {policy!r}, which is no method of the experiment.")
+        if setup.expert is not None and cfg.methods[name].data.kind != "expert":
+            raise ValueError(
+                f"experiment.setup.{name}.expert={setup.expert} is for methods.{name}.data.kind=expert, which is "
+                f"{cfg.methods[name].data.kind}."
+            )
+        if not setup.length > 0:
+            raise ValueError(f"experiment.setup.{name}.length must be positive, got {setup.length}.")
         if setup.ranking is not None and setup.ranking not in cfg.rankings:
             raise ValueError(
                 f"experiment.setup.{name}.ranking={setup.ranking!r} is not among rankings: {', '.join(cfg.rankings)}."

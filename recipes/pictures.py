@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Any
 
 from omegaconf import DictConfig
 
 from dpa.policy import Decoding
+from dpa.report.experiment import read_json
 from dpa.report.player import pack_players
 from envs.store import SceneStore
-from recipes.cli import write_json
+from recipes.cli import plain, write_json
 from recipes.jobs import runs_of
 from recipes.models import open_policy, weights_digest
 from recipes.play import roll_out
@@ -35,14 +34,17 @@ def write_players(
     runs, seed, options = runs_of(cfg), cfg.seeds[0], cfg.pictures
     files = {method: runs.policy(seed, policy) for method, policy in policies.items()}
     named = labels(cfg, policies)
+    distance = build_distance(cfg.collection.ranking, "collection.ranking")
     decided_by = {
         "policies": {method: weights_digest(open_policy(path)[0]) for method, path in files.items()},
         "decodings": {method: asdict(decodings[method]) for method in files},
         "scenes": fingerprint(scenes),
-        "options": dict(options),
+        "labels": named,
+        "ranking": distance.describe(),
+        "options": plain(options),
         "seed": seed,
     }
-    if kept_players(runs.players).get("options") == decided_by:
+    if runs.players.is_file() and read_json(runs.players).get("options") == decided_by:
         return
     players = roll_out(
         {named[method]: path for method, path in files.items()},
@@ -51,13 +53,8 @@ def write_players(
         decoding={named[method]: decodings[method] for method in files},
         num_rollouts=options.num_rollouts,
         kept=options.kept,
-        distance=build_distance(cfg.collection.ranking, "collection.ranking"),
+        distance=distance,
         seed=seed,
         device=cfg.device,
     )
     write_json(runs.players, pack_players(players) | {"options": decided_by})
-
-
-def kept_players(path: Any) -> dict[str, Any]:
-    """What an earlier run has rolled out; empty where there is nothing."""
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}

@@ -24,7 +24,7 @@ class Job(NamedTuple):
         name: shown with its bars.
     """
 
-    function: Callable[..., None]
+    function: Callable[..., Any]
     arguments: tuple[Any, ...]
     name: str
 
@@ -59,8 +59,8 @@ class Workers:
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
 
-    def run(self, jobs: list[Job], name: str) -> Iterator[tuple[str, float]]:
-        """Run jobs, as many at a time as there are workers, and give each one's name and seconds as it ends.
+    def run(self, jobs: list[Job], name: str) -> Iterator[tuple[str, float, Any]]:
+        """Run jobs, as many at a time as there are workers; gives name, seconds and result of each as it ends.
 
         Args:
             jobs: in the order in which they start.
@@ -72,13 +72,13 @@ class Workers:
         """
         if self._pool is None:
             for job in progress(jobs, name, unit="job"):
-                yield job.name, _work(job, self.threads)
+                yield job.name, *_work(job, self.threads)
             return
         futures = {self._pool.submit(_work, job, self.threads): job.name for job in jobs}
         try:
             with progress(total=len(jobs), description=name, unit="job") as bar:
                 for future in as_completed(futures):
-                    yield futures[future], future.result()
+                    yield futures[future], *future.result()
                     bar.update()
         except BrokenProcessPool as error:
             raise ChildProcessError(
@@ -94,9 +94,9 @@ def _start(lock: Any, started: Any) -> None:
         use_line(started.value, lock)
 
 
-def _work(job: Job, threads: int) -> float:
+def _work(job: Job, threads: int) -> tuple[float, Any]:
     torch.set_num_threads(threads)
     start = time.perf_counter()
     with stage(job.name):
-        job.function(*job.arguments)
-    return time.perf_counter() - start
+        result = job.function(*job.arguments)
+    return time.perf_counter() - start, result

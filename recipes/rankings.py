@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
 
 from dpa.policy import MotionLM
 from dpa.preferences import PreferenceStore
-from dpa.ranking import Distance, PreferenceDistance
+from dpa.ranking import Distance, PreferenceDistance, Ranking
 from dpa.ranking.rival import DisplacementDistance
+from envs.scene import Scene
 from envs.store import SceneStore
 from recipes.cli import build
 from recipes.models import weights_digest
@@ -36,6 +40,21 @@ def build_distance(section: DictConfig, name: str) -> Distance:
     return build(DISTANCES[kind], OmegaConf.create(options), name)
 
 
+def open_ranked_scenes(folder: str | Path, scenes: SceneStore) -> PreferenceStore:
+    """A preference store of some scenes, whoever rolled them out.
+
+    Raises:
+        ValueError: it is of other scenes: its indices would mean nothing here.
+    """
+    store = PreferenceStore(folder)
+    if store.provenance.scenes != fingerprint(scenes):
+        raise ValueError(
+            f"{folder} ranks rollouts of other scenes; give the scenes and the split that it was collected with, or "
+            "collect again."
+        )
+    return store
+
+
 def open_preferences(folder: str | Path, scenes: SceneStore, model: MotionLM, policy: str | Path) -> PreferenceStore:
     """A preference store, refused where its tokens would mean nothing here.
 
@@ -48,12 +67,37 @@ def open_preferences(folder: str | Path, scenes: SceneStore, model: MotionLM, po
     Raises:
         ValueError: it is of other scenes or of another policy.
     """
-    store = PreferenceStore(folder)
-    if store.provenance.scenes != fingerprint(scenes):
-        raise ValueError(
-            f"{folder} ranks rollouts of other scenes; give the scenes and the split that it was collected with, or "
-            "collect again."
-        )
+    store = open_ranked_scenes(folder, scenes)
     if store.provenance.policy != weights_digest(model):
         raise ValueError(f"{folder} ranks rollouts of another policy than {policy}; give that one, or collect again.")
     return store
+
+
+class TimedDistance:
+    """A distance that adds up the seconds that it takes in this process.
+
+    Args:
+        distance: that does the work.
+
+    Examples:
+        >>> from envs.sources.synthetic import straight_road
+        >>> from dpa.ranking import log_trajectory
+        >>> scene, timed = straight_road(2), TimedDistance(DisplacementDistance())
+        >>> ranking = timed(scene, log_trajectory(scene, 80)[None], None)
+        >>> timed.seconds > 0 and timed.describe() == DisplacementDistance().describe()
+        True
+    """
+
+    def __init__(self, distance: Distance) -> None:
+        self.distance, self.seconds = distance, 0.0
+
+    def describe(self) -> dict[str, Any]:
+        """That of the distance."""
+        return self.distance.describe()
+
+    def __call__(self, scene: Scene, trajectories: Tensor, controlled: Tensor) -> Ranking:
+        """Rank, and look at the clock."""
+        start = time.perf_counter()
+        ranking = self.distance(scene, trajectories, controlled)
+        self.seconds += time.perf_counter() - start
+        return ranking

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,31 +27,59 @@ class Stages:
     def __init__(self, workers: Workers, path: Path) -> None:
         self.workers, self.path = workers, path
         self.account = read_account(path)
+        self._asked: dict[str, set[str]] = {}
 
-    def run(self, name: str, job: Callable[..., None], config: Any, arguments: Sequence[tuple]) -> None:
+    def run(
+        self, name: str, job: Callable[..., dict[str, float] | None], config: Any, arguments: Sequence[tuple]
+    ) -> None:
         """Run one job for each tuple of arguments.
 
         Args:
             name: of the stage.
-            job: of a module, so that a worker can import it.
+            job: of a module, so that a worker can import it. It may give seconds that it spent for other stages.
             config: its first argument, the same for all jobs.
             arguments: the others; they name the job.
         """
         if not arguments:
             return
         jobs = [Job(job, (config, *each), " ".join(map(str, (name, *each)))) for each in arguments]
-        kept = self.account.setdefault(name, {})
-        for done, seconds in self.workers.run(jobs, name):
-            if done not in kept:
-                kept[done] = seconds
-                write_json(self.path, self.account)
+        for done, seconds, others in self.workers.run(jobs, name):
+            spent = others or {}
+            self._book(name, done, seconds - sum(spent.values()))
+            for other, part in spent.items():
+                self._book(other, done, part)
+
+    def _book(self, stage: str, job: str, seconds: float) -> None:
+        self._asked.setdefault(stage, set()).add(job)
+        kept = self.account.setdefault(stage, {})
+        if job not in kept:
+            kept[job] = seconds
+            write_json(self.path, self.account)
 
     @property
     def seconds(self) -> dict[str, float]:
-        """Worker-seconds of each stage."""
-        return {name: sum(jobs.values()) for name, jobs in self.account.items()}
+        """Worker-seconds of each stage, of the jobs that were asked for here."""
+        return {name: sum(self.account[name][job] for job in sorted(jobs)) for name, jobs in self._asked.items()}
 
 
 def read_account(path: Path) -> dict[str, dict[str, float]]:
     """``{stage: {job: seconds}}``, empty where nothing has run yet."""
     return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Keep other commands out of a folder as long as the block runs.
+
+    Raises:
+        ValueError: another one is at work there.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / ".lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(
+                f"another command is at work in {folder}; wait for it, or name another output folder."
+            ) from None
+        yield

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,6 +19,7 @@ from recipes.cli import build, finished, plain, write_json
 from recipes.models import open_policy, weights_digest
 from recipes.partial import PartialResult
 from recipes.play import named
+from recipes.provenance import pasteable
 from recipes.rankings import build_distance
 from recipes.rolled import Rolled, rolled
 from recipes.scenes import fingerprint
@@ -120,7 +119,7 @@ def how_made(cfg: DictConfig, recipe: str, scenes: SceneStore, measured: dict[st
         measured: what :func:`study` gave.
     """
     return {
-        "command": shlex.join(["python", "-m", f"recipes.{recipe}", *sys.argv[1:]]),
+        "command": pasteable(recipe),
         "scenes": len(scenes),
         "policies": list(measured),
         "num_rollouts": cfg.num_rollouts,

@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 import json
-import os
-import platform
-import sys
 from collections.abc import Mapping
-from datetime import UTC, datetime
-from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from dpa.policy import Decoding
 from dpa.report.statistics import compare_methods
 from dpa.report.table import REFERENCE
+from recipes.candidates import SIDES
 from recipes.cli import plain
 from recipes.evaluate import SCENE_FIGURES
 from recipes.jobs import runs_of
 from recipes.likelihoods import PROBED
-from recipes.runs import method_of
+from recipes.methods import setup_of
+from recipes.runs import SNAPSHOT, method_of
 from recipes.scenes import Splits
 
-PACKAGES = ("torch", "torchrl", "tensordict", "pot", "numpy", "dpa-omf")
-TOLD = ("name", "title", "paper", "question", "headline", "axis", "split")
+TOLD = ("name", "title", "paper", "question", "headline", "axis", "split", "published")
 """What an experiment says of itself."""
 Run = tuple[str, Decoding]
 """A method at a decoding."""
@@ -45,7 +42,7 @@ class Results:
     def row(self, method: str, decoding: Decoding, seed: int, split: str) -> dict[str, Any]:
         """Means of one run, and the file with the values of every scene."""
         path = self.runs.evaluation(seed, self.policies[method], split, decoding)
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = _read(path)
         return {
             "method": method,
             "seed": seed,
@@ -63,7 +60,7 @@ class Results:
     def likelihood(self, method: str, seed: int) -> dict[str, Any]:
         """What a policy thinks of logs and rollouts of the reported scenes."""
         path = self.runs.likelihood(seed, self.policies[method], self.split)
-        mean = json.loads(path.read_text(encoding="utf-8"))["mean"]
+        mean = _read(path)["mean"]
         return {
             "method": method,
             "seed": seed,
@@ -73,11 +70,12 @@ class Results:
 
     def paired(self, chosen: list[Run], reference: Run) -> list[dict[str, Any]]:
         """Realism of each run minus that of a reference, by scene and seed, with intervals."""
+        if not chosen:
+            return []
         scores = {
             str(number): {str(seed): self._realism(*run, seed) for seed in self.seeds}
             for number, run in enumerate([reference, *chosen])
         }
-        found = compare_methods(scores, "0")
         return [
             entry
             | {
@@ -88,12 +86,21 @@ class Results:
                 "against_top_p": reference[1].top_p,
                 "against_temperature": reference[1].temperature,
             }
-            for (method, decoding), entry in zip(chosen, found, strict=True)
+            for (method, decoding), entry in zip(chosen, compare_methods(scores, "0"), strict=True)
         ]
 
+    def leave_out(self, chosen: list[Run]) -> int:
+        """Leave the scenes out for which some run has no realism, here and from now on; gives their number."""
+        runs = [self._scores(*run, seed) for run in chosen for seed in self.seeds]
+        self.known = [all(score is not None for score in scene) for scene in zip(*runs, strict=True)]
+        return self.known.count(False)
+
     def _realism(self, method: str, decoding: Decoding, seed: int) -> list[float]:
-        path = self.runs.evaluation(seed, self.policies[method], self.split, decoding)
-        return json.loads(path.read_text(encoding="utf-8"))["per_scene"]["realism"]
+        scores = self._scores(method, decoding, seed)
+        return [score for score, known in zip(scores, self.known, strict=True) if known]
+
+    def _scores(self, method: str, decoding: Decoding, seed: int) -> list[float | None]:
+        return _read(self.runs.evaluation(seed, self.policies[method], self.split, decoding))["per_scene"]["realism"]
 
 
 def summarise_experiment(
@@ -116,53 +123,80 @@ def summarise_experiment(
         own: method -> its own best decoding.
         stages: worker-seconds of each stage.
     """
-    results, experiment = Results(cfg, policies), cfg.experiment
+    results, experiment = Results(cfg, policies), plain(cfg.experiment)
     common, grid = Decoding(*cfg.decoding.common), [Decoding(*each) for each in cfg.decoding.grid]
     at_common = [(method, common) for method in policies]
     others = [(REFERENCE, each) for each in grid if each != common]
     at_best = [(method, own[method]) for method in policies]
+    headline = (experiment["headline"], own[experiment["headline"]])
+    rivals = [run for run in at_best if run[0] not in (REFERENCE, headline[0])]
     likelihood = [results.likelihood(method, seed) for method in policies for seed in cfg.seeds]
     accuracy = {(entry["method"], entry["seed"]): entry["pair_accuracy"] for entry in likelihood}
+    left_out = results.leave_out(list(dict.fromkeys([*at_common, *others, *at_best])))
 
     def rows(chosen: list[Run]) -> list[dict[str, Any]]:
-        found = results.rows(chosen, experiment.split)
+        found = results.rows(chosen, experiment["split"])
         return [row | {"pair_accuracy": accuracy[row["method"], row["seed"]]} for row in found]
 
-    return {
-        **{
-            name: plain(experiment)[name]
-            for name in ("name", "title", "paper", "question", "headline", "axis", "split")
-        },
-        "metric": cfg.evaluation.metric,
+    return {name: experiment[name] for name in TOLD} | {
+        "metric": str(cfg.evaluation.metric),
         "scenes": {**splits.sizes(), "source": cfg.scenes.source},
         "seeds": list(cfg.seeds),
         "methods": list(policies),
         "labels": labels(cfg, policies),
-        "published": plain(experiment.published),
         "policies": dict(policies),
         "common": [common.top_p, common.temperature],
         "chosen": {method: [decoding.top_p, decoding.temperature] for method, decoding in own.items()},
+        "left_out": left_out,
         "rows": rows(at_common + others),
         "paired": results.paired(at_common[1:] + others, at_common[0]),
-        "own_best": {"rows": rows(at_best), "paired": results.paired(at_best[1:], at_best[0])},
+        "own_best": {
+            "rows": rows(at_best),
+            "paired": results.paired(at_best[1:], at_best[0]),
+            "versus": results.paired(rivals, headline),
+        },
         "tuning": results.rows([(method, each) for method in policies for each in grid], "tune"),
         "likelihood": likelihood,
         "curves": {
             method: {str(seed): results.runs.relative(results.runs.training(seed, method)) for seed in cfg.seeds}
             for method in cfg.methods
         },
+        "budget": {method: budget(cfg, method) for method in cfg.methods},
         "stages": dict(stages),
-        "wall_seconds": sum(stages.values()),
+        "worker_seconds": sum(stages.values()),
         "config": plain(cfg),
-        "versions": {"python": sys.version.split()[0], **{name: version(name) for name in PACKAGES}},
-        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPU cores, device {cfg.device}",
-        "date": datetime.now(UTC).date().isoformat(),
-        "command": " ".join(["python -m recipes.compare", *sys.argv[1:]]),
     }
+
+
+def budget(cfg: DictConfig, method: str) -> dict[str, Any]:
+    """What one training run of a method takes in, with the runs that it goes on from.
+
+    Args:
+        cfg: of the experiment.
+        method: its name.
+
+    Returns:
+        ``steps``, ``rollouts`` (read in these steps) and ``start``.
+    """
+    setup, data = setup_of(cfg, method), cfg.methods[method].data
+    options = OmegaConf.merge(cfg.alignment, setup.changes(cfg.alignment))
+    sides = 1 if SIDES[data.kind] == "targets" else 2
+    before = {"steps": 0, "rollouts": 0} if setup.start == REFERENCE else budget(cfg, setup.start)
+    return {
+        "steps": before["steps"] + options.steps,
+        "rollouts": before["rollouts"] + options.steps * options.scenes_per_step * options.pairs_per_scene * sides,
+        "start": setup.start,
+    }
+
+
+def _read(path: Path) -> dict[str, Any]:
+    return json.loads(path.read_text(encoding="utf-8"))
 
 
 def labels(cfg: DictConfig, policies: Mapping[str, str]) -> dict[str, str]:
     """How tables call methods; a snapshot is called by its step."""
     given = plain(cfg.experiment.labels)
     named = {policy: given.get(method_of(policy), method_of(policy)) for policy in policies}
-    return {policy: name + policy.removeprefix(method_of(policy)).replace("@", " @ ") for policy, name in named.items()}
+    return {
+        policy: name + policy.removeprefix(method_of(policy)).replace(SNAPSHOT, " @ ") for policy, name in named.items()
+    }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,9 +10,9 @@ from numpy import nanmean
 from omegaconf import DictConfig
 
 from dpa.policy import ContextOptions, MotionLM
-from dpa.preferences import PreferenceStore
 from envs.store import SceneStore
 from recipes.likelihoods import PROBED, make_probes, probe
+from recipes.rankings import open_ranked_scenes
 
 
 class Watch(NamedTuple):
@@ -32,20 +33,25 @@ class Look:
     Args:
         watch: the scenes.
         context: how scenes are cut up.
-        model: in training.
+        model: in training, and as it is now the reference of ``tune/kl``.
         options: the section ``alignment``.
+
+    Raises:
+        ValueError: rollouts of other scenes than the tuning ones.
     """
 
     def __init__(self, watch: Watch, context: ContextOptions, model: MotionLM, options: DictConfig) -> None:
-        store = PreferenceStore(watch.preferences)
+        store = open_ranked_scenes(watch.preferences, watch.scenes)
         rows = range(min(options.watch_scenes, len(store)))
         pairs = min(options.watch_pairs, store.provenance.num_rollouts // 2)
-        self.model, self.probes = model, make_probes(store, watch.scenes, context, model.tokenizer, pairs, rows)
+        tokenizer = copy.deepcopy(model.tokenizer).cpu()  # logs are read on the CPU, wherever the model is
+        self.probes = make_probes(store, watch.scenes, context, tokenizer, pairs, rows)
+        self.model, self.reference = model, copy.deepcopy(model).eval()
 
     def __call__(self, device: str) -> dict[str, float]:
         """Means over the scenes, as curves are named."""
         training = self.model.training
         self.model.eval()
-        found = probe(self.model, self.probes, device)
+        found = probe(self.model, self.probes, device, self.reference)
         self.model.train(training)
-        return {f"tune/{name}": nanmean([each[name] for each in found]) for name in PROBED}
+        return {f"tune/{name}": nanmean([each[name] for each in found]) for name in (*PROBED, "kl")}

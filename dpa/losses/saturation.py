@@ -20,7 +20,7 @@ class SaturationWatch:
     there does so by the options. Later the mean of the last :data:`WINDOW` steps does.
 
     Args:
-        options: of the loss; ``alpha``, ``score_reduction`` and ``reference`` are read where it has them.
+        options: of the loss; ``link``, ``alpha``, ``score_reduction`` and ``reference`` are read where it has them.
 
     Examples:
         >>> watch = SaturationWatch({"alpha": 1.0, "reference": True, "score_reduction": "token_mean"})
@@ -39,12 +39,13 @@ class SaturationWatch:
 
         Args:
             step: counted from 0.
-            figures: what the loss returned for the step; one without ``saturated`` (imitation) is never told off.
+            figures: what the loss returned for the step; one without ``saturated`` (imitation), or whose weights do
+                not follow the sigmoid of a logit (squared and hinge link), is never told off.
 
         Returns:
             The warning, or None.
         """
-        if self._warned or "saturated" not in figures:
+        if self._warned or "saturated" not in figures or self.options.get("link", "logistic") != "logistic":
             return None
         self._steps.append((step, float(figures["saturated"])))
         share = sum(value for _, value in self._steps) / len(self._steps)

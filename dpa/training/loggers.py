@@ -104,13 +104,7 @@ def make_logger(
         [(1, 0.5)]
         ['method,realism', 'reference,0.7']
     """
-    if backend not in ("csv", *MODULES):
-        raise ValueError(f"logger.backend must be csv, wandb or tensorboard, got {backend!r}.")
-    if backend in MODULES and importlib.util.find_spec(MODULES[backend]) is None:
-        raise ImportError(
-            f"logger.backend={backend} needs the package {MODULES[backend]!r}: install it "
-            f"(pip install {MODULES[backend]}) or choose logger.backend=csv."
-        )
+    check_backend(backend)
     folder = Path(folder)
     files = CsvLogger(folder, config, resume_step)
     if backend == "wandb":
@@ -118,6 +112,22 @@ def make_logger(
     if backend == "tensorboard":
         return _Tee(files, _TensorboardLogger(folder, resume_step))
     return files
+
+
+def check_backend(backend: str) -> None:
+    """Refuse a backend that cannot be used.
+
+    Raises:
+        ValueError: an unknown backend.
+        ImportError: the backend's package is missing; the message says what to install.
+    """
+    if backend not in ("csv", *MODULES):
+        raise ValueError(f"logger.backend must be csv, wandb or tensorboard, got {backend!r}.")
+    if backend in MODULES and importlib.util.find_spec(MODULES[backend]) is None:
+        raise ImportError(
+            f"logger.backend={backend} needs the package {MODULES[backend]!r}: install it "
+            f"(pip install {MODULES[backend]}) or choose logger.backend=csv."
+        )
 
 
 def read_curve(folder: str | os.PathLike[str], metric: str) -> list[tuple[int, float]]:

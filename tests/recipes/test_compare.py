@@ -19,7 +19,7 @@ SMALL = [
     "drift_rollouts=2",
     "alignment.watch_interval=2",
 ]
-OF_THE_MACHINE = ("stages", "wall_seconds", "versions", "command", "config", "date")
+OF_THE_MACHINE = ("stages", "worker_seconds", "versions", "command", "config", "date", "revision", "machine")
 """What differs between two runs of the same options."""
 
 pytestmark = pytest.mark.slow
@@ -50,7 +50,11 @@ def test_every_method_is_compared_with_the_reference(finished: Path) -> None:
     assert at_common == ["reference", *METHODS] == found["methods"]
     assert [entry["method"] for entry in found["paired"]] == [*METHODS, "reference"]
     assert {row["method"] for row in found["own_best"]["rows"]} == {"reference", *METHODS}
-    assert len(found["tuning"]) == 6 * 2
+    assert len(found["tuning"]) == 6 * 2 and found["left_out"] == 0
+    assert {entry["against"] for entry in found["own_best"]["versus"]} == {"dpa_omf"}
+    assert [entry["method"] for entry in found["own_best"]["versus"]] == METHODS[1:]
+    assert found["budget"]["dpa_omf"] == {"steps": 4, "rollouts": 16, "start": "reference"}
+    assert found["budget"]["sft_best_oa"]["rollouts"] == 8
     for row in found["rows"]:
         assert 0 < row["realism"] <= 1 and 0 <= row["pair_accuracy"] <= 1 and row["n_scenes"] == 3
     drift = {entry["method"]: entry["kl"] for entry in found["likelihood"]}
@@ -97,6 +101,8 @@ def test_every_experiment_runs_in_the_folder_of_the_first(
     more = [f"experiment={name}"]
     if name in ("scaling", "step_size"):
         more.append("alignment.snapshots=[2]")
+    if name == "scaling":  # four rollouts of a scene make one pair of its quarters
+        more += [f"methods.omf_r{r}.data.rankings_per_scene=1" for r in (2, 4, 8)]
     outcome = run("compare", *command(options, finished, *more))
     assert outcome.status == 0, outcome.err
     found = experiment(finished, name)

@@ -8,13 +8,14 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
+from recipes.check import check_experiment
 from recipes.cli import CONFIG
-from recipes.compare import check_experiment, snapshots_of
+from recipes.compare import snapshots_of
 from recipes.methods import read_setups
 from recipes.pool import Workers
-from recipes.stages import Stages, read_account
+from recipes.stages import Stages, alone_in, read_account
 
 EXPERIMENTS = sorted(path.stem for path in (Path(CONFIG["config_path"]) / "experiment").glob("*.yaml"))
 FURTHER = "+experiment.setup.dpa_omf={start:dpa_adef}"
@@ -38,8 +39,8 @@ def test_every_experiment_fits_together(name: str) -> None:
 def test_a_method_comes_after_those_that_it_starts_from_or_learns_from() -> None:
     order = list(read_setups(configuration("experiment=rounds")))
     assert order.index("dpa_omf") < order.index("omf_round_2") < order.index("omf_round_3")
-    order = list(read_setups(configuration("+experiment.setup.dpa_omf={expert:sft_best_oa}")))
-    assert order.index("sft_best_oa") < order.index("dpa_omf")
+    order = list(read_setups(configuration("experiment=losses")))
+    assert order.index("sft_best_oa") < order.index("afd_expert")
 
 
 @pytest.mark.parametrize(
@@ -55,11 +56,49 @@ def test_a_method_comes_after_those_that_it_starts_from_or_learns_from() -> None
         (("experiment.checkpoints=best",), "experiment.checkpoints must be one of last, select, all, got 'best'"),
         (("experiment.checkpoints=all",), r"needs checkpoints: say for example alignment.snapshots=\[75\]"),
         (("decoding.common=[0.5,1.0]",), r"decoding.common=\[0.5, 1.0\] must be one of decoding.grid"),
+        (("decoding.grid=[0.95,0.85]",), r"decoding.grid takes pairs \[top-p, temperature\], got 0.95"),
+        (("decoding.grid=[[0.95,1.0],[1.5,1.0]]",), r"top_p must lie in \(0, 1\], got 1.5"),
+        (("seeds=[0,0]",), r"seeds must be one or more, each once, got \[0, 0\]"),
+        (("aligned_scenes=0",), "aligned_scenes must be 1 or more, or null for all, got 0"),
+        (("evaluation.metric=2031",), "2031"),
+        (("logger.backend=mlflow",), "got 'mlflow'"),
+        (("experiment.headline=nobody",), "experiment.headline=nobody is no method of the experiment"),
+        (("+methods.dpa_omf.loss.alpah=1",), "no option 'alpah'"),
+        (("methods.dpa_omf.data.kind=sets",), "learns from pairs, and method.data.kind=sets gives sets"),
+        (
+            ("+experiment.setup.dpa_omf={alignment:{step:3}}",),
+            "experiment.setup.dpa_omf.alignment has no option 'step'",
+        ),
+        (("+experiment.setup.dpa_omf={alignment:{steps:5}}",), "alignment of dpa_omf:.warmup must be less than"),
+        (("+experiment.setup.dpa_omf={length:0}",), "experiment.setup.dpa_omf.length must be positive, got 0"),
+        (("+experiment.setup.dpa_omf={expert:dpa_adef}",), "is for methods.dpa_omf.data.kind=expert, which is pairs"),
+        (("ranking@collection.ranking=displacement",), "couples nothing; say pictures.scenes=0"),
+        (("experiment=rounds", "experiment.checkpoints=select", "alignment.snapshots=[40]"), "needs another method"),
     ],
 )
 def test_an_experiment_that_cannot_work_is_refused_before_any_work(options: tuple[str, ...], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         check_experiment(configuration(*options))
+
+
+def test_one_name_is_one_training_in_all_experiments() -> None:
+    """They share a folder: a name that meant two things would be refused there."""
+    meaning: dict[str, tuple[str, str]] = {}
+    for name in (name for name in EXPERIMENTS if name != "base"):
+        cfg = configuration(f"experiment={name}")
+        for method, setup in read_setups(cfg).items():
+            alignment = OmegaConf.merge(cfg.alignment, setup.changes(cfg.alignment))
+            data, loss = cfg.methods[method].data, cfg.methods[method].loss
+            training = str((data, loss, alignment, setup.start, setup.expert, cfg.rankings.get(setup.ranking or "")))
+            assert meaning.setdefault(method, (name, training))[1] == training, (method, name, meaning[method][0])
+
+
+def test_one_command_at_a_time_works_in_a_folder(tmp_path: Path) -> None:
+    study, refused = tmp_path / "study", pytest.raises(ValueError, match="another command is at work in .*study")
+    with alone_in(study), refused, alone_in(study):
+        pass
+    with alone_in(study):
+        pass
 
 
 def test_snapshots_end_before_the_last_step_of_their_method() -> None:
@@ -81,6 +120,18 @@ def test_the_account_keeps_what_each_job_took_the_first_time(tmp_path: Path) -> 
     kept = read_account(path)["sleep"]
     assert {name: kept[name] for name in first["sleep"]} == first["sleep"] and "sleep 0.02 c" in kept
     assert again.seconds["sleep"] == pytest.approx(sum(kept.values()))
+
+
+def test_seconds_that_a_job_spent_for_another_stage_are_booked_there(tmp_path: Path) -> None:
+    with Workers(1, threads=1) as workers:
+        stages = Stages(workers, tmp_path / "stages.json")
+        stages.run("collect", _sleep_and_rank, 1.0, [(0.03,)])
+    assert stages.seconds["rank"] == 0.02 and 0.01 <= stages.seconds["collect"] < 0.03
+
+
+def _sleep_and_rank(factor: float, seconds: float) -> dict[str, float]:
+    time.sleep(factor * seconds)
+    return {"rank": 0.02}
 
 
 def _sleep(factor: float, seconds: float, name: str) -> None:

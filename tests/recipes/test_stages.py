@@ -483,6 +483,64 @@ def test_a_loss_that_would_misread_the_data_is_refused(loss: str, data: str, mes
         check_fit(OmegaConf.create({"loss": {"kind": loss}, "data": {"kind": data}}))
 
 
+def watched(runs: Path, options: Callable, folder: Path, *more: str) -> list[str]:
+    given = [f"policy={runs / 'reference/policy.pt'}", f"preferences={runs / 'preferences'}", f"output={folder}"]
+    return options("align", *given, "method.data.num=2", "alignment.watch_interval=2", *more)
+
+
+def test_scenes_that_no_loss_sees_are_looked_at_along_the_way(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path
+) -> None:
+    tuned = [*collect_into(tmp_path / "tuned", runs, options), "split=tune"]
+    assert run("collect", *tuned).status == 0
+    command = watched(runs, options, tmp_path / "omf", f"watch={tmp_path / 'tuned'}", "alignment.snapshots=[2,4]")
+    with mock.patch("recipes.align.SaturationWatch", _interrupting(3)):
+        assert run("align", *command).status == 130
+    outcome = run("align", *command)
+    assert outcome.status == 0, outcome.err
+    for name in ("nll_preferred", "nll_unpreferred", "nll_demonstration", "pair_accuracy", "entropy", "kl"):
+        curve = read_curve(tmp_path / "omf", f"tune/{name}")
+        assert [step for step, _ in curve] == [0, 2, 4], "each step once, also after a kill"
+    drift = [value for _, value in read_curve(tmp_path / "omf", "tune/kl")]
+    assert drift[0] == pytest.approx(0, abs=1e-7) and drift[-1] > 0
+    plain_run = watched(runs, options, tmp_path / "plain")
+    assert run("align", *plain_run).status == 0
+    last = weights(tmp_path / "omf/policy.pt")
+    assert torch.equal(last, weights(tmp_path / "plain/policy.pt")), "looking changes nothing"
+    assert torch.equal(last, weights(tmp_path / "omf/step_4/policy.pt"))
+    assert not torch.equal(last, weights(tmp_path / "omf/step_2/policy.pt"))
+
+
+def _interrupting(step: int) -> type:
+    """A watch for saturation during which somebody presses Ctrl-C."""
+
+    class Interrupting:
+        def __init__(self, options: object) -> None: ...
+
+        def __call__(self, now: int, figures: object) -> None:
+            if now == step:
+                raise KeyboardInterrupt
+
+    return Interrupting
+
+
+def test_rollouts_of_other_scenes_are_not_watched(run: Callable, options: Callable, runs: Path, tmp_path: Path) -> None:
+    outcome = run("align", *watched(runs, options, tmp_path / "omf", f"watch={runs / 'preferences'}"))
+    assert outcome.status == 2 and "ranks rollouts of other scenes" in outcome.err
+
+
+def test_alignment_learns_from_the_scenes_that_it_is_given(runs: Path, options: Callable) -> None:
+    cfg = compose_recipe("align", options, runs)
+    store, scenes = PreferenceStore(runs / "preferences"), open_splits(cfg.scenes).train
+    model, context, _ = open_policy(runs / "reference/policy.pt")
+    data = OmegaConf.merge(cfg.method.data, {"num": 2})
+    every = make_candidates(data, store, scenes, context, model.tokenizer, 0)
+    some = make_candidates(data, store, scenes, context, model.tokenizer, 0, among=[1, 4])
+    assert len(every) == 6 and len(some) == 2
+    for group, whole in zip(some, (every[1], every[4]), strict=True):
+        assert torch.equal(group.preferred, whole.preferred)
+
+
 def test_a_loss_that_saturates_is_told_once(run: Callable, options: Callable, runs: Path, tmp_path: Path) -> None:
     given = ["method=cpl", "method.data.num=2", "method.loss.alpha=1000", f"output={tmp_path / 'cpl'}"]
     given += [f"policy={runs / 'reference/policy.pt'}", f"preferences={runs / 'preferences'}"]
@@ -748,14 +806,15 @@ def test_jobs_run_here_one_after_the_other() -> None:
     with Workers(1, threads=1) as workers:
         ended = list(workers.run([Job(ran.append, (number,), f"job {number}") for number in range(3)], "jobs"))
     assert ran == [0, 1, 2]
-    assert [name for name, _ in ended] == ["job 0", "job 1", "job 2"] and all(seconds >= 0 for _, seconds in ended)
+    assert [name for name, *_ in ended] == ["job 0", "job 1", "job 2"] and all(seconds >= 0 for _, seconds, _ in ended)
 
 
 def test_the_error_of_a_job_is_the_error_of_all_and_the_workers_go_on() -> None:
     with Workers(2, threads=1) as workers:
         with pytest.raises(ValueError, match="Expecting property name"):
             list(workers.run([Job(json.loads, ("{",), "bad")], "jobs"))
-        assert [name for name, _ in workers.run([Job(json.loads, ("{}",), "good")], "jobs")] == ["good"]
+        ((name, _, result),) = workers.run([Job(json.loads, ("{}",), "good")], "jobs")
+        assert (name, result) == ("good", {})
 
 
 def test_a_killed_worker_is_told_with_what_to_do() -> None:

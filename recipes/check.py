@@ -1,0 +1,103 @@
+"""What can be known to be wrong with an experiment is told before hours of work."""
+
+from __future__ import annotations
+
+from omegaconf import DictConfig, OmegaConf
+
+from dpa.policy import Decoding, MotionLM
+from dpa.ranking import PreferenceDistance
+from dpa.realism.config import RealismConfig
+from dpa.tokens import VerletTokenizer
+from dpa.training.loggers import check_backend
+from recipes.cli import check_steps
+from recipes.losses import check_fit, make_loss
+from recipes.methods import read_setups
+from recipes.models import policy_config
+from recipes.rankings import build_distance
+
+SPLITS = ("tune", "eval")
+"""What an experiment can report."""
+CHECKPOINTS = ("last", "select", "all")
+"""What becomes of the snapshots of an alignment: there are none, one of them may be chosen, or each is shown."""
+
+
+def check_experiment(cfg: DictConfig) -> None:
+    """Refuse options that do not fit.
+
+    Args:
+        cfg: of ``recipes.compare``.
+
+    Raises:
+        ValueError: naming the option.
+    """
+    check_steps(cfg.pretraining, "pretraining")
+    policy_config(cfg.model)
+    RealismConfig.load(str(cfg.evaluation.metric))
+    check_backend(cfg.logger.backend)
+    if not cfg.seeds or len(set(cfg.seeds)) < len(cfg.seeds):
+        raise ValueError(f"seeds must be one or more, each once, got {list(cfg.seeds)}.")
+    if cfg.aligned_scenes is not None and cfg.aligned_scenes < 1:
+        raise ValueError(f"aligned_scenes must be 1 or more, or null for all, got {cfg.aligned_scenes}.")
+    _check_decodings(cfg)
+    _check_rankings(cfg)
+    _check_methods(cfg)
+    _check_report(cfg)
+
+
+def _check_decodings(cfg: DictConfig) -> None:
+    for name, each in [("common", cfg.decoding.common), *(("grid", each) for each in cfg.decoding.grid)]:
+        if not OmegaConf.is_list(each) or len(each) != 2:
+            raise ValueError(
+                f"decoding.{name} takes pairs [top-p, temperature], got {each!r}; say for example [0.95,1.0]."
+            )
+        Decoding(*each)
+    if list(cfg.decoding.common) not in [list(each) for each in cfg.decoding.grid]:
+        raise ValueError(f"decoding.common={list(cfg.decoding.common)} must be one of decoding.grid.")
+
+
+def _check_rankings(cfg: DictConfig) -> None:
+    own = build_distance(cfg.collection.ranking, "collection.ranking")
+    for name, options in cfg.rankings.items():
+        build_distance(OmegaConf.merge(cfg.collection.ranking, options), f"rankings.{name}")
+    if cfg.pictures.scenes and not isinstance(own, PreferenceDistance):
+        raise ValueError(
+            f"the player shows couplings, and collection.ranking.kind={cfg.collection.ranking.kind} couples nothing; "
+            "say pictures.scenes=0."
+        )
+
+
+def _check_methods(cfg: DictConfig) -> None:
+    model = MotionLM("nano", VerletTokenizer())  # any will do: a loss is made to see its options refused
+    for name, setup in read_setups(cfg).items():
+        check_fit(cfg.methods[name])
+        make_loss(cfg.methods[name].loss, model)
+        unknown = sorted(set(setup.alignment) - set(cfg.alignment))
+        if unknown:
+            raise ValueError(f"experiment.setup.{name}.alignment has no option {unknown[0]!r}.")
+        check_steps(OmegaConf.merge(cfg.alignment, setup.changes(cfg.alignment)), f"alignment of {name}:")
+
+
+def _check_report(cfg: DictConfig) -> None:
+    experiment, setups = cfg.experiment, read_setups(cfg)
+    if experiment.headline not in cfg.methods:
+        raise ValueError(
+            f"experiment.headline={experiment.headline} is no method of the experiment; name one of "
+            f"{', '.join(cfg.methods)}."
+        )
+    if experiment.split not in SPLITS:
+        raise ValueError(f"experiment.split must be one of {', '.join(SPLITS)}, got {experiment.split!r}.")
+    if experiment.checkpoints not in CHECKPOINTS:
+        raise ValueError(
+            f"experiment.checkpoints must be one of {', '.join(CHECKPOINTS)}, got {experiment.checkpoints!r}."
+        )
+    if experiment.checkpoints != "last" and not cfg.alignment.snapshots:
+        raise ValueError(
+            f"experiment.checkpoints={experiment.checkpoints} needs checkpoints: say for example "
+            f"alignment.snapshots=[{cfg.alignment.steps // 2}]."
+        )
+    further = [name for name, setup in setups.items() if setup.expert or setup.start != "reference"]
+    if experiment.checkpoints == "select" and further:
+        raise ValueError(
+            f"experiment.checkpoints=select chooses when all methods are trained, and {further[0]} needs another "
+            "method before; say checkpoints=last."
+        )

@@ -1,0 +1,54 @@
+"""What made a result: code, packages, machine, command."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+PACKAGES = ("torch", "torchrl", "tensordict", "pot", "numpy")
+
+
+def provenance(recipe: str, device: str) -> dict[str, Any]:
+    """Versions, git revision (None outside a checkout), machine, date, and a command that can be pasted into a shell.
+
+    Args:
+        recipe: that is running.
+        device: of torch.
+
+    Examples:
+        >>> sorted(provenance("compare", "cpu"))
+        ['command', 'date', 'machine', 'revision', 'versions']
+    """
+    machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPU cores"
+    if torch.device(device).type == "cuda":
+        machine += f", {torch.cuda.get_device_name(device)}"
+    return {
+        "versions": {"python": sys.version.split()[0], **{name: version(name) for name in PACKAGES}},
+        "revision": revision(),
+        "machine": machine,
+        "date": datetime.now(UTC).date().isoformat(),
+        "command": pasteable(recipe),
+    }
+
+
+def pasteable(recipe: str) -> str:
+    """The command at hand, quoted for a shell."""
+    return shlex.join(["python", "-m", f"recipes.{recipe}", *sys.argv[1:]])
+
+
+def revision() -> str | None:
+    """Commit of the code, with a mark where files differ from it; None where it is no git checkout."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return None
