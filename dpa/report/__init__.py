@@ -8,7 +8,7 @@ knows a policy or an environment. A study is a folder RUNS::
     seed_<n>/preferences_*/      ranked rollouts of the reference of a seed
     stages.json                  seconds and jobs of each stage
     players.json                 scenes and rollouts to play: dpa.report.player.pack_players
-    validity/, sensitivity/, discriminator/    summary.json and pictures of a study of rankings
+    validity/, sensitivity/, discriminator/    summary.json of a study of rankings
 
 :func:`dpa.report.study.read_study` reads it and :func:`dpa.report.page.write_study` makes one page of it. In a row, a
 number that was not measured is None, never NaN. The reference's rows carry the method name

@@ -13,15 +13,18 @@ from dpa.report.table import REFERENCE, summarise
 
 Decoding = tuple[float, float]
 """Top-p and temperature."""
-NUMBER = (int, float)
+NUMBER, NONE = (int, float), type(None)
 ROW = {"method": str, "seed": int, "top_p": NUMBER, "temperature": NUMBER, "file": str, "n_scenes": int}
 """What identifies a row; every other entry is a figure: a number, or None where it was not measured."""
 PAIRED = {
-    "method": str, "top_p": NUMBER, "temperature": NUMBER, "against_top_p": NUMBER, "against_temperature": NUMBER,
-    "realism_difference": NUMBER, "ci95": list, "over": str, "n_seeds": int,
+    "method": str, "top_p": NUMBER, "temperature": NUMBER, "against": str, "against_top_p": NUMBER,
+    "against_temperature": NUMBER, "realism_difference": NUMBER, "ci95": list, "over": str, "n_seeds": int,
 }  # fmt: skip
 LIKELIHOOD = {"method": str, "seed": int, "file": str}
+BUDGET = {"steps": int, "rollouts": int, "start": str}
 SPLITS = ("train", "tune", "eval")
+REPORTED = {"eval": "evaluation", "tune": "tuning"}
+"""Splits that an experiment may report, in words."""
 
 
 @dataclass(frozen=True)
@@ -31,10 +34,12 @@ class Comparison:
     Attributes:
         rows: one for each method, decoding and seed; see :data:`ROW`.
         paired: realism of a method minus that of the reference, scene by scene; see :data:`PAIRED`.
+        versus: realism of a method minus that of the headline's, likewise.
     """
 
     rows: Sequence[Mapping[str, Any]]
     paired: Sequence[Mapping[str, Any]]
+    versus: Sequence[Mapping[str, Any]] = ()
 
     def records(self) -> list[dict[str, Any]]:
         """One record for each method and decoding: means over seeds; see :func:`~dpa.report.table.summarise`."""
@@ -48,6 +53,10 @@ class Comparison:
         """Rows of a method at a decoding, in order of seeds."""
         found = [row for row in self.rows if row["method"] == method and decoding_of(row) == decoding]
         return sorted(found, key=lambda row: row["seed"])
+
+    def base(self) -> list[Mapping[str, Any]]:
+        """Rows of the reference that the others are compared with; none where nothing is compared."""
+        return [row for entry in self.paired[:1] for row in self.of(REFERENCE, decoding_against(entry))]
 
 
 @dataclass(frozen=True)
@@ -73,10 +82,12 @@ class Experiment:
         path: the file.
         name: of the experiment; that of its configuration.
         title: for people.
-        paper: what it repeats of the paper, or what it adds.
+        paper: what it repeats of the paper; None where it repeats nothing.
         question: that it answers.
         metric: configuration of the realism metric.
         scenes: number of scenes of each split, and ``source``.
+        split: that the numbers are of, ``eval`` or ``tune``.
+        left_out: scenes of it that some run has no realism for; differences are over the others.
         seeds: of the training runs.
         methods: in the order of tables.
         labels: what the methods are called.
@@ -85,14 +96,17 @@ class Experiment:
         common: decoding of ``at_common``.
         chosen: each method's best decoding on the tuning scenes.
         at_common: all methods at the common decoding, the reference also at the others of the grid.
-        own_best: each method at its chosen decoding, against the reference at its own.
+        own_best: each method at its chosen decoding, against the reference and the headline's method at their own.
         tuning: rows of every method at every decoding of the grid, on the tuning scenes.
-        likelihood: rows ``{"method", "seed", "file"}`` and figures of likelihood, on the evaluation scenes.
+        likelihood: rows ``{"method", "seed", "file"}`` and figures of likelihood, on the reported scenes.
         axis: of a scaling experiment.
         curves: run folders by method and seed, relative to the folder of the study.
-        stages: seconds of each.
-        wall_seconds: of all.
+        budget: for each method that is trained the optimiser ``steps`` of one run, the ``rollouts`` read in them, and
+            the policy it ``start``s from; a further round counts those before it.
+        stages: worker-seconds of its own jobs, by stage.
+        worker_seconds: of all of them.
         config: of the run.
+        revision: commit of the code; None outside a repository.
         versions: of packages.
         machine: it ran on.
         date: it was finished.
@@ -102,10 +116,12 @@ class Experiment:
     path: Path
     name: str
     title: str
-    paper: str
+    paper: str | None
     question: str
     metric: str
     scenes: Mapping[str, Any]
+    split: str
+    left_out: int
     seeds: Sequence[int]
     methods: Sequence[str]
     labels: Mapping[str, str]
@@ -119,26 +135,20 @@ class Experiment:
     likelihood: Sequence[Mapping[str, Any]]
     axis: Axis | None
     curves: Mapping[str, Mapping[str, str]]
+    budget: Mapping[str, Mapping[str, Any]]
     stages: Mapping[str, float]
-    wall_seconds: float
+    worker_seconds: float
     config: Mapping[str, Any]
+    revision: str | None
     versions: Mapping[str, str]
     machine: str
     date: str
     command: str
 
-    def label(self, method: str) -> str:
-        """What a method is called; a snapshot ``name@step`` by its method and the step.
-
-        Raises:
-            ValueError: the method has no label.
-        """
-        if method in self.labels:
-            return self.labels[method]
-        base, at, step = method.partition("@")
-        if not at or base not in self.labels:
-            raise ValueError(f"{self.path}: labels has no entry for {method!r}; it has {', '.join(self.labels)}.")
-        return f"{self.labels[base]}, step {step}"
+    @property
+    def reported(self) -> str:
+        """The scenes that the numbers are of, such as ``54 evaluation scenes``."""
+        return f"{self.scenes[self.split]} {REPORTED[self.split]} scenes"
 
     def grid(self) -> list[Decoding]:
         """Every decoding that was tried on the tuning scenes."""
@@ -148,6 +158,11 @@ class Experiment:
 def decoding_of(row: Mapping[str, Any]) -> Decoding:
     """Decoding of a row."""
     return (float(row["top_p"]), float(row["temperature"]))
+
+
+def decoding_against(entry: Mapping[str, Any]) -> Decoding:
+    """Decoding of what a paired difference is taken from."""
+    return (float(entry["against_top_p"]), float(entry["against_temperature"]))
 
 
 def in_words(decoding: Decoding) -> str:
@@ -201,15 +216,19 @@ def read_experiment(path: str | Path) -> Experiment:
     if not isinstance(content, dict):
         raise ValueError(f"{path} holds {type(content).__name__}, not the result of an experiment.")
     kinds: dict[str, Any] = {
-        "name": str, "title": str, "paper": str, "question": str, "metric": str, "scenes": dict, "seeds": list,
-        "methods": list, "labels": dict, "published": dict, "headline": str, "common": list, "chosen": dict,
-        "rows": list, "paired": list, "own_best": dict, "tuning": list, "likelihood": list, "axis": (dict, type(None)),
-        "curves": dict, "stages": dict, "wall_seconds": NUMBER, "config": dict, "versions": dict, "machine": str,
+        "name": str, "title": str, "paper": (str, NONE), "question": str, "metric": str, "scenes": dict, "split": str,
+        "left_out": int, "seeds": list, "methods": list, "labels": dict, "published": dict, "headline": str,
+        "common": list, "chosen": dict, "rows": list, "paired": list, "own_best": dict, "tuning": list,
+        "likelihood": list, "axis": (dict, NONE), "curves": dict, "budget": dict, "stages": dict,
+        "worker_seconds": NUMBER, "config": dict, "revision": (str, NONE), "versions": dict, "machine": str,
         "date": str, "command": str,
     }  # fmt: skip
     _check(content, kinds, str(path))
-    _check(content["own_best"], {"rows": list, "paired": list}, f"{path}: own_best")
+    _check(content["own_best"], {"rows": list, "paired": list, "versus": list}, f"{path}: own_best")
     _check(content["scenes"], {**dict.fromkeys(SPLITS, int), "source": str}, f"{path}: scenes")
+    for method, budget in content["budget"].items():
+        _check(budget, BUDGET, f"{path}: budget.{method}")
+    _check_names(content, path)
     _check_lists(content, path)
     axis = content["axis"]
     if axis is not None:
@@ -218,18 +237,31 @@ def read_experiment(path: str | Path) -> Experiment:
         if len(decoding) != 2 or not all(isinstance(part, NUMBER) for part in decoding):
             raise ValueError(f"{path}: the decoding of {method} must be [top_p, temperature], got {decoding!r}.")
     made = {key: content[key] for key in kinds if key not in ("rows", "paired", "common", "chosen", "own_best", "axis")}
-    experiment = Experiment(
+    own = content["own_best"]
+    return Experiment(
         path=path,
         common=_decoding(content["common"]),
         chosen={method: _decoding(decoding) for method, decoding in content["chosen"].items()},
         at_common=Comparison(content["rows"], content["paired"]),
-        own_best=Comparison(content["own_best"]["rows"], content["own_best"]["paired"]),
+        own_best=Comparison(own["rows"], own["paired"], own["versus"]),
         axis=None if axis is None else Axis(**axis),
         **made,
     )
-    for method in experiment.methods:
-        experiment.label(method)
-    return experiment
+
+
+def _check_names(content: Mapping[str, Any], path: Path) -> None:
+    """What is named exists."""
+    methods, headline = content["methods"], content["headline"]
+    if content["split"] not in REPORTED:
+        raise ValueError(f"{path}: split must be one of {', '.join(REPORTED)}, got {content['split']!r}.")
+    if headline not in methods or REFERENCE not in methods:
+        raise ValueError(
+            f"{path}: methods must hold {REFERENCE!r} and the headline {headline!r}, got {', '.join(methods)}."
+        )
+    trained = {*content["curves"], *content["budget"], *(budget["start"] for budget in content["budget"].values())}
+    for method in dict.fromkeys([*methods, *(method.partition("@")[0] for method in methods), *sorted(trained)]):
+        if method not in content["labels"]:
+            raise ValueError(f"{path}: labels has no entry for {method!r}; it has {', '.join(content['labels'])}.")
 
 
 def _check_lists(content: Mapping[str, Any], path: Path) -> None:
@@ -238,25 +270,24 @@ def _check_lists(content: Mapping[str, Any], path: Path) -> None:
     lists = (
         ("rows", content["rows"], ROW), ("tuning", content["tuning"], ROW), ("own_best.rows", own["rows"], ROW),
         ("paired", content["paired"], PAIRED), ("own_best.paired", own["paired"], PAIRED),
-        ("likelihood", content["likelihood"], LIKELIHOOD),
+        ("own_best.versus", own["versus"], PAIRED), ("likelihood", content["likelihood"], LIKELIHOOD),
     )  # fmt: skip
+    against = {"paired": REFERENCE, "own_best.paired": REFERENCE, "own_best.versus": content["headline"]}
     for name, entries, kinds in lists:
         for place, entry in enumerate(entries):
             where = f"{path}: {name}[{place}]"
             _check(entry, kinds, where)
             if entry["method"] not in content["methods"]:
                 raise ValueError(f"{where} is of {entry['method']!r}, which is none of methods.")
-            figures = {key: value for key, value in entry.items() if key not in {**kinds, "against": str}}
-            for key, value in figures.items():
+            if name in against and entry["against"] != against[name]:
+                raise ValueError(f"{where} must be against {against[name]!r}, got {entry['against']!r}.")
+            for key, value in entry.items():
+                if key in kinds:
+                    continue
                 if value is not None and not (isinstance(value, NUMBER) and math.isfinite(value)):
                     raise ValueError(f"{where}: {key} must be a number or null, got {value!r}.")
             if "ci95" in kinds and not (len(entry["ci95"]) == 2 and entry["ci95"][0] <= entry["ci95"][1]):
                 raise ValueError(f"{where}: ci95 must be [low, high], got {entry['ci95']!r}.")
-    if content["headline"] not in content["methods"] or REFERENCE not in content["methods"]:
-        raise ValueError(
-            f"{path}: methods must hold {REFERENCE!r} and the headline {content['headline']!r}, got "
-            f"{', '.join(content['methods'])}."
-        )
 
 
 def _check(content: Any, kinds: Mapping[str, Any], where: str) -> None:

@@ -33,12 +33,13 @@ def plot_comparison(experiment: Experiment, path: str | Path) -> None:
     records = experiment.own_best.records()
     figure = blank_figure(11, 1.1 + 0.42 * len(records))
     panels = figure.subplots(1, 4, sharey=True, width_ratios=[2.4, 1, 1, 1])
-    names = [f"{experiment.label(record['method'])}  ({in_words(decoding_of(record))})" for record in records]
+    names = [f"{experiment.labels[record['method']]}  ({in_words(decoding_of(record))})" for record in records]
     panels[0].set_yticks(range(len(names)), names)
     panels[0].set_ylim(len(names) - 0.4, -0.6)
     _forest(panels[0], records)
     for axes, (key, title) in zip(panels[1:], BUCKETS, strict=True):
         _bucket(axes, records, experiment.own_best.rows, key, title)
+    figure.suptitle(f"{experiment.title}, {experiment.reported}", fontsize=9, color=INK)
     for axes in panels:
         calm(axes, grid="x")
         axes.tick_params(axis="y", length=0)

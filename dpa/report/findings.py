@@ -22,7 +22,7 @@ def headline(experiment: Experiment) -> str:
     if entry is None:
         return "No claim: no method was compared with the reference."
     low, high = entry["ci95"]
-    name, where = experiment.label(experiment.headline), f"on {experiment.scenes['eval']} scenes"
+    name, where = experiment.labels[experiment.headline], f"on {experiment.reported}"
     interval = f"95 % interval [{signed(low)}, {signed(high)}]"
     if low <= 0 <= high:
         change = signed(entry["realism_difference"])
@@ -39,7 +39,8 @@ def reservations(experiment: Experiment, num_compared: int | None = None) -> lis
 
     Args:
         experiment: that the headline is of.
-        num_compared: differences with an interval that stand on the page; by default those of the experiment.
+        num_compared: differences of realism with an interval that stand on the page; by default those of the
+            experiment.
     """
     own = experiment.own_best
     entry = own.entry(experiment.headline)
@@ -52,14 +53,77 @@ def reservations(experiment: Experiment, num_compared: int | None = None) -> lis
         notes.append(f"{entry['n_seeds']} training runs: an interval over so few is a little too narrow.")
     if entry is not None:
         notes += _decoding(experiment, entry)
-    compared = len(own.paired) + len(experiment.at_common.paired) if num_compared is None else num_compared
+    notes += [note for note in (chosen_on_the_same(experiment), left_out(experiment), budgets(experiment)) if note]
+    compared = differences_of(experiment) if num_compared is None else num_compared
     if compared > 1:
-        notes.append(f"{compared} differences stand on this page; their intervals are not corrected for that.")
+        notes.append(
+            f"{compared} differences of realism stand on this page, and more of other figures; their intervals are not "
+            "corrected for that."
+        )
     notes.append(
-        f"Scores on {experiment.scenes['eval']} scenes compare the methods of this page with each other, "
-        "not with published tables."
+        f"Scores on {experiment.reported} compare the methods of this page with each other, not with published tables."
     )
     return notes
+
+
+def differences_of(experiment: Experiment) -> int:
+    """How many differences of realism an experiment has."""
+    own = experiment.own_best
+    return len(own.paired) + len(own.versus) + len(experiment.at_common.paired)
+
+
+def chosen_on_the_same(experiment: Experiment) -> str | None:
+    """The reservation that an experiment on the tuning scenes needs."""
+    if experiment.split != "tune":
+        return None
+    return (
+        "Decodings were chosen on these very tuning scenes, so what methods reach at their own best is a little too "
+        "good, for all alike."
+    )
+
+
+def left_out(experiment: Experiment) -> str | None:
+    """How many scenes the differences do without."""
+    if not experiment.left_out:
+        return None
+    rest = experiment.scenes[experiment.split] - experiment.left_out
+    return f"Differences are over {rest} of {experiment.reported}: on the others some run has no realism."
+
+
+def budgets(experiment: Experiment) -> str | None:
+    """Which methods train on more or less than the headline's does; None where none does.
+
+    Examples:
+        >>> import types
+        >>> budget = {"dpa_omf": {"steps": 60, "rollouts": 960}, "round 2": {"steps": 120, "rollouts": 1920}}
+        >>> labels = {"dpa_omf": "DPA-OMF", "round 2": "round 2"}
+        >>> budgets(types.SimpleNamespace(budget=budget, labels=labels, headline="dpa_omf"))
+        'Budgets differ. Over that of DPA-OMF, round 2: 2 times the steps, 2 times the rollouts.'
+    """
+    base = experiment.headline.partition("@")[0]
+    if base not in experiment.budget:
+        return None
+    mine = {kind: of_base for kind in ("steps", "rollouts") if (of_base := experiment.budget[base][kind])}
+    alike: dict[str, list[str]] = {}
+    for method, budget in experiment.budget.items():
+        times = {kind: budget[kind] / of_base for kind, of_base in mine.items()}
+        told = [f"{ratio:.3g} times the {kind}" for kind, ratio in times.items() if ratio != 1]
+        if told:
+            alike.setdefault(", ".join(told), []).append(experiment.labels[method])
+    if not alike:
+        return None
+    each = "; ".join(f"{', '.join(labels)}: {told}" for told, labels in alike.items())
+    return f"Budgets differ. Over that of {experiment.labels[base]}, {each}."
+
+
+def ordering(experiment: Experiment) -> str:
+    """Which methods can be told apart from the headline's, each at its own best decoding."""
+    sides: dict[str, list[str]] = {"better": [], "worse": [], "not told apart": []}
+    for entry in experiment.own_best.versus:
+        low, high = entry["ci95"]
+        side = "better" if low > 0 else "worse" if high < 0 else "not told apart"
+        sides[side].append(experiment.labels[entry["method"]])
+    return "; ".join(f"{side}: {', '.join(labels)}" for side, labels in sides.items() if labels)
 
 
 def _decoding(experiment: Experiment, entry: Mapping[str, Any]) -> list[str]:
@@ -78,7 +142,7 @@ def _decoding(experiment: Experiment, entry: Mapping[str, Any]) -> list[str]:
             f"(at {in_words(decoding_of(best))} instead of {in_words(experiment.common)})."
         )
     edges = [
-        f"{experiment.label(method)} ({in_words(experiment.chosen[method])})"
+        f"{experiment.labels[method]} ({in_words(experiment.chosen[method])})"
         for method in (REFERENCE, experiment.headline)
         if method in experiment.chosen and _at_edge(experiment.chosen[method], grid)
     ]
@@ -90,9 +154,17 @@ def _decoding(experiment: Experiment, entry: Mapping[str, Any]) -> list[str]:
 
 
 def _at_edge(chosen: Decoding, grid: list[Decoding]) -> bool:
-    """A neighbour beyond the grid was never tried; beyond top-p 1 there is none."""
+    """The best of a row of decodings is its last: one beyond was never tried.
+
+    A row is of three or more that differ in one number alone: of two, either is the last. Beyond top-p 1 there is none.
+
+    Examples:
+        >>> grid = [(1.0, 1.0), (0.9, 1.0), (0.8, 1.0), (0.9, 0.8)]
+        >>> [_at_edge(chosen, grid) for chosen in grid]
+        [False, False, True, False]
+    """
     for place, value in enumerate(chosen):
-        tried = sorted({decoding[place] for decoding in grid})
-        if len(tried) > 1 and (value == tried[0] or (value == tried[-1] and not (place == 0 and value == 1))):
+        row = sorted({decoding[place] for decoding in grid if decoding[1 - place] == chosen[1 - place]})
+        if len(row) >= 3 and (value == row[0] or (value == row[-1] and not (place == 0 and value == 1))):
             return True
     return False

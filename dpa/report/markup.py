@@ -8,7 +8,7 @@ from html import escape
 from importlib import resources
 from typing import NamedTuple
 
-from dpa.report.table import difference
+from dpa.report.table import MISSING, difference, signed
 
 
 class Html(str):
@@ -127,8 +127,19 @@ def command(text: str) -> Html:
 def interval(mean: float | None, ci95: Sequence[float] | None) -> Html:
     """A difference with its interval, standing out where the interval does not contain 0."""
     text = difference(mean, ci95)
-    apart = ci95 is not None and not ci95[0] <= 0 <= ci95[1]
-    return element("strong", text) if apart else html(text)
+    return element("strong", text) if ci95 is not None and _apart(ci95) else html(text)
+
+
+def stacked(mean: float | None, ci95: Sequence[float] | None) -> Html:
+    """A difference above its interval, for a narrow column; otherwise as :func:`interval`."""
+    if mean is None or ci95 is None:
+        return html(MISSING)
+    ends = element("small", f"[{signed(ci95[0])}, {signed(ci95[1])}]")
+    return joined([element("strong", signed(mean)) if _apart(ci95) else signed(mean), ends], "")
+
+
+def _apart(ci95: Sequence[float]) -> bool:
+    return not ci95[0] <= 0 <= ci95[1]
 
 
 def sources(files: Sequence[str]) -> Html:

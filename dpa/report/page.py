@@ -107,7 +107,7 @@ def _sections(study: Study, experiments: Iterable[str]) -> Iterable[Section]:
         yield experiment_section(experiment, colours[experiment.name], evaluations)
     yield from _some(training_section(list(study.experiments.values()), study.folder, colours))
     for name, found in study.summaries.items():
-        yield study_section(name, found, study.pictures[name], SHOWS[name])
+        yield study_section(name, found, study.folder, SHOWS[name])
     if study.players is not None:
         yield Section("scenes", "Scenes", player(study.players), headed=False)
     yield from _some(account_section(study))

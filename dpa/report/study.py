@@ -14,7 +14,7 @@ from dpa.report.experiment import Experiment, read_experiment, read_json
 STUDIES = ("validity", "sensitivity", "discriminator")
 """Folders of a study that a recipe of their own fills."""
 FIRST = "methods"
-"""Experiment that the headline is of, and that stands first."""
+"""Experiment that stands first where there is one, so that the headline is of it."""
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,10 @@ class Study:
 
     Attributes:
         folder: of the study.
-        experiments: by name, ``methods`` first.
+        experiments: by name, :data:`FIRST` before the others.
         stages: seconds of each job of each stage.
         players: packed scenes and rollouts, see :func:`dpa.report.player.pack_players`.
         summaries: ``summary.json`` of each of :data:`STUDIES`.
-        pictures: PNGs of each of :data:`STUDIES`.
         cards: data card of each store of preferences, by its folder relative to the study's.
     """
 
@@ -36,13 +35,12 @@ class Study:
     stages: Mapping[str, Mapping[str, float]]
     players: Mapping[str, Any] | None
     summaries: Mapping[str, Mapping[str, Any]]
-    pictures: Mapping[str, list[Path]]
     cards: Mapping[str, DataCard]
 
     @property
     def main(self) -> Experiment | None:
-        """The experiment that the headline is of."""
-        return self.experiments.get(FIRST)
+        """The experiment that the headline is of: the first one."""
+        return next(iter(self.experiments.values()), None)
 
 
 def read_study(folder: str | Path) -> Study:
@@ -73,7 +71,6 @@ def read_study(folder: str | Path) -> Study:
         stages=read_json(stages) if stages.is_file() else {},
         players=read_json(players) if players.is_file() else None,
         summaries=summaries,
-        pictures={name: sorted((folder / name).glob("*.png")) for name in STUDIES},
         cards=_cards(folder),
     )
 

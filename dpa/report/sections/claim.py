@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from dpa.report.experiment import Experiment, decoding_of, in_words
-from dpa.report.findings import headline, reservations
-from dpa.report.markup import Html, element, joined
-from dpa.report.study import FIRST, Study
+from dpa.report.experiment import Experiment, decoding_against, decoding_of, in_words
+from dpa.report.findings import differences_of, headline, reservations
+from dpa.report.markup import Html, element, hint, joined
+from dpa.report.study import Study
 from dpa.report.table import signed
 
 
@@ -16,13 +16,12 @@ def claim(study: Study) -> Html:
     """Headline, both differences in large type, and reservations.
 
     Args:
-        study: whose ``methods`` experiment the headline is of.
+        study: whose first experiment the headline is of.
     """
     experiment = study.main
     if experiment is None:
-        sentence = f"No claim: the study has no experiment {FIRST!r}, which compares the methods."
-        return element("p", sentence, class_="headline")
-    compared = sum(len(each.own_best.paired) + len(each.at_common.paired) for each in study.experiments.values())
+        return element("p", "No claim: the study has no experiment that compares methods.", class_="headline")
+    compared = sum(differences_of(each) for each in study.experiments.values())
     notes = [element("li", note) for note in reservations(experiment, compared)]
     cards = [
         _card(experiment, "each at its own best decoding", experiment.own_best.entry(experiment.headline)),
@@ -31,6 +30,11 @@ def claim(study: Study) -> Html:
     return joined(
         [
             element("p", headline(experiment), class_="headline"),
+            hint(
+                joined(
+                    ["of the experiment ", element("a", experiment.title, href=f"#experiment-{experiment.name}")], ""
+                )
+            ),
             element("div", *cards, class_="cards"),
             element("ul", *notes, class_="reservations"),
         ]
@@ -42,7 +46,6 @@ def _card(experiment: Experiment, title: str, entry: Mapping[str, Any] | None) -
         return Html("")
     low, high = entry["ci95"]
     kind = "better" if low > 0 else "worse" if high < 0 else "open"
-    against = (float(entry["against_top_p"]), float(entry["against_temperature"]))
     return element(
         "div",
         element("div", title, class_="card-title"),
@@ -50,8 +53,8 @@ def _card(experiment: Experiment, title: str, entry: Mapping[str, Any] | None) -
         element("div", f"[{signed(low)}, {signed(high)}] realism, 95 %"),
         element(
             "div",
-            f"{experiment.label(experiment.headline)} at {in_words(decoding_of(entry))}, reference at "
-            f"{in_words(against)}; {entry['n_seeds']} seeds",
+            f"{experiment.labels[experiment.headline]} at {in_words(decoding_of(entry))}, reference at "
+            f"{in_words(decoding_against(entry))}; {entry['n_seeds']} seeds, {experiment.reported}",
             class_="hint",
         ),
         class_="card",

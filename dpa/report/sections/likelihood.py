@@ -11,9 +11,11 @@ import numpy as np
 
 from dpa.report.charts import Chart, Line, curves, gallery
 from dpa.report.curves import Curve, read_curves
-from dpa.report.experiment import Comparison, Experiment
-from dpa.report.markup import Html, Section, element, folded, hint, joined, sources, table
-from dpa.report.table import REFERENCE, number
+from dpa.report.experiment import Experiment
+from dpa.report.markup import Html, Section, element, folded, hint, joined, sources, stacked, table
+from dpa.report.paired import paired_figure, quiet_change
+from dpa.report.study import Evaluations
+from dpa.report.table import MINUS, REFERENCE, number
 
 FIGURES = {
     "pair_accuracy": "pair accuracy ↑", "nll_preferred": "NLL preferred", "nll_unpreferred": "NLL unpreferred",
@@ -26,17 +28,26 @@ SIDES = {
     "tune/nll_demonstration": ("log", "#3c4043"),
 }
 HEALTH = {
-    "train/logit_std": "spread of the preference logits", "train/saturated": "share of saturated pairs",
-    "train/kl": "KL to the reference", "train/entropy": "entropy of the tokens",
-}  # fmt: skip
+    "train/logit_std": ("Spread of the preference logits", "standard deviation of the logits"),
+    "train/saturated": ("Share of saturated pairs", "share of pairs"),
+    "train/kl": ("KL to the reference", "KL per token [nats]"),
+    "train/entropy": ("Entropy of the tokens", "entropy per token [nats]"),
+}
+"""Title and axis of the figure of a scalar."""
 POINTS = 40
 """Most points of a curve on the page; longer ones are averaged over blocks of steps."""
 TABLE_3 = ("dpa_omf", "adversarial_afd")
 """Methods of the paper's table 3."""
+OF_TABLE_3 = {"pair_accuracy": "pair accuracy ↑", "realism": "realism ↑", "min_ade": "minADE ↓"}
 
 
-def likelihood_table(experiment: Experiment) -> Html:
-    """Likelihood of ranked rollouts of the evaluation scenes, and with it the paper's table 3 where its methods are."""
+def likelihood_table(experiment: Experiment, evaluations: Evaluations) -> Html:
+    """Likelihood of ranked rollouts of the reported scenes, and with it the paper's table 3 where its methods are.
+
+    Args:
+        experiment: to show.
+        evaluations: figures of every scene.
+    """
     by_method = {
         method: [row for row in experiment.likelihood if row["method"] == method] for method in experiment.methods
     }
@@ -46,39 +57,51 @@ def likelihood_table(experiment: Experiment) -> Html:
         return Html("")
     rows = []
     for method, of_method in by_method.items():
-        means = [number(_mean(of_method, key), DIGITS.get(key, 2)) for key in shown]
-        rows.append([experiment.label(method), *means, sources([row["file"] for row in of_method])])
+        cells = []
+        for key in shown:
+            digits, base = DIGITS.get(key, 2), by_method.get(REFERENCE, [])
+            found = None if method == REFERENCE else paired_figure(of_method, base, key, evaluations)
+            cells.append(joined([number(_mean(of_method, key), digits), quiet_change(found, digits)], ""))
+        rows.append([experiment.labels[method], *cells, sources([row["file"] for row in of_method])])
     parts = [
-        *([_table_3(experiment, by_method)] if set(TABLE_3) <= set(by_method) else []),
+        *([_table_3(experiment, by_method, evaluations)] if set(TABLE_3) <= set(by_method) else []),
         element("h3", "Likelihood of ranked rollouts"),
         table(["method", *(FIGURES[key] for key in shown), "seeds"], rows),
         hint(
-            "On the reference's ranked rollouts of the evaluation scenes, means over seeds. Pair accuracy: how often "
-            "the nearer rollout of a pair is the likelier one. NLL: negative log-likelihood."
+            f"On the reference's ranked rollouts of the {experiment.reported}, means over seeds; in small type the "
+            "difference from the reference with its 95 % interval. Pair accuracy: how often the nearer rollout of a "
+            "pair is the likelier one. NLL: negative log-likelihood per token [nats]."
         ),
     ]
     return joined(parts)
 
 
-def _table_3(experiment: Experiment, by_method: Mapping[str, Sequence[Mapping[str, Any]]]) -> Html:
+def _table_3(
+    experiment: Experiment, by_method: Mapping[str, Sequence[Mapping[str, Any]]], evaluations: Evaluations
+) -> Html:
+    def runs(method: str, key: str) -> Sequence[Mapping[str, Any]]:
+        at_common = experiment.at_common.of(method, experiment.common)
+        return by_method.get(method, []) if key == "pair_accuracy" else at_common
+
     rows = []
     for method in TABLE_3:
         published = experiment.published.get(method, {})
-        found = Comparison(experiment.at_common.of(method, experiment.common), []).records()
-        values = {"pair_accuracy": _mean(by_method[method], "pair_accuracy")}
-        values |= {key: found[0][key] if found else None for key in ("realism", "min_ade")}
-        cells = [
-            joined([number(value, 3), *([element("small", number(published[key], 3))] if key in published else [])], "")
-            for key, value in values.items()
-        ]
-        rows.append([experiment.label(method), *cells])
-    return joined(
-        [
-            element("h3", "Who learns the ranking (table 3)"),
-            table(["method", "pair accuracy ↑", "realism ↑", "minADE ↓"], rows),
-            hint("Realism and minADE at the common decoding; in grey the paper's numbers."),
-        ]
+        cells = []
+        for key in OF_TABLE_3:
+            paper = [element("small", f"paper {number(published[key], 3)}")] if key in published else []
+            cells.append(joined([number(_mean(runs(method, key), key), 3), *paper], ""))
+        rows.append([experiment.labels[method], *cells])
+    mine = TABLE_3[0]
+    for other in (TABLE_3[1], REFERENCE):
+        changes = [paired_figure(runs(mine, key), runs(other, key), key, evaluations) for key in OF_TABLE_3]
+        cells = [stacked(None, None) if each is None else stacked(each.mean, (each.low, each.high)) for each in changes]
+        rows.append([f"{experiment.labels[mine]} {MINUS} {experiment.labels[other]}", *cells])
+    note = (
+        f"On {experiment.reported}; realism and minADE at the common decoding. Differences with 95 % intervals, bold "
+        "where 0 lies outside."
     )
+    head = element("h3", "Who learns the ranking (table 3)")
+    return joined([head, table(["method", *OF_TABLE_3.values()], rows), hint(note)])
 
 
 def training_section(
@@ -98,7 +121,7 @@ def training_section(
             for method, seeds in experiment.curves.items()
         }
         runs = {method: seeds for method, seeds in runs.items() if seeds}
-        charts = [chart for method, seeds in runs.items() for chart in _likelihood(experiment.label(method), seeds)]
+        charts = [chart for method, seeds in runs.items() for chart in _likelihood(experiment.labels[method], seeds)]
         health = [chart for key in HEALTH for chart in _health(experiment, runs, key, colours[experiment.name])]
         if charts or health:
             body = joined([gallery(charts, small=True), element("h3", "Health of the alignment"), gallery(health)])
@@ -126,9 +149,10 @@ def _health(
         line
         for method, seeds in runs.items()
         if method != REFERENCE
-        for line in _lines(experiment.label(method), key, seeds, colours[method])
+        for line in _lines(experiment.labels[method], key, seeds, colours[method])
     ]
-    return [curves(content, HEALTH[key], x="step", y=key, height=260)] if content else []
+    title, axis = HEALTH[key]
+    return [curves(content, title, x="step", y=axis, height=260)] if content else []
 
 
 def _lines(name: str, key: str, seeds: Sequence[Mapping[str, Curve]], colour: str) -> list[Line]:
@@ -163,4 +187,4 @@ def blocks(curve: Curve, points: int) -> tuple[list[float], list[float]]:
 
 def _mean(rows: Sequence[Mapping[str, Any]], key: str) -> float | None:
     values = [row.get(key) for row in rows]
-    return None if None in values else sum(values) / len(values)
+    return None if not values or None in values else sum(values) / len(values)

@@ -1,14 +1,13 @@
-"""Where the numbers of a study of rankings come from, and its figures where its summary cannot be shown."""
+"""Where the numbers of a study of rankings come from, and what is said where its summary is of another version."""
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from dpa.report.markup import Html, Section, command, element, facts, folded, hint, html, joined
+from dpa.report.markup import Html, Section, command, element, facts, folded
 
 
 def origin(name: str, found: Mapping[str, Any]) -> Html:
@@ -16,51 +15,35 @@ def origin(name: str, found: Mapping[str, Any]) -> Html:
 
     Args:
         name: of the study.
-        found: its summary, with ``made`` where the recipe wrote it.
+        found: its summary.
     """
-    made = found.get("made")
+    made = found["made"]
     numbers = facts(
         {"numbers": element("code", f"{name}/summary.json"), "of each scene": element("code", f"{name}/*.json")}
     )
-    if made is None:
-        return folded("where the numbers are", numbers, command(f"python -m recipes.{name}"))
     config = element("pre", json.dumps(made["config"], indent=2, ensure_ascii=False, allow_nan=False))
     return folded("command and configuration", command(made["command"]), numbers, folded("configuration", config))
 
 
 def study_section(
-    name: str, found: Mapping[str, Any], pictures: list[Path], show: Callable[[Mapping[str, Any]], Section]
+    name: str, found: Mapping[str, Any], folder: Path, show: Callable[[Mapping[str, Any]], Section]
 ) -> Section:
-    """A study by its interactive figures, or by its pictures where the summary lacks what they need.
+    """The section of a study of rankings.
 
     Args:
         name: of the study.
         found: its summary.
-        pictures: PNGs that its recipe drew.
+        folder: of results, for the message.
         show: makes the section from the summary.
 
     Raises:
-        ValueError: the summary lacks an entry, and there is no picture to show instead.
+        ValueError: the summary lacks an entry, or has another kind of it; the message names file and entry.
     """
     try:
         return show(found)
     except (KeyError, TypeError) as error:
-        if not pictures:
-            raise ValueError(f"{name}/summary.json lacks {error}; run python -m recipes.{name} again.") from None
-        note = hint(
-            f"{name}/summary.json lacks {error}: its pictures stand here; python -m recipes.{name} makes both anew."
-        )
-        return Section(name, name.capitalize(), joined([note, *map(picture, pictures)]))
-
-
-def picture(path: Path) -> Html:
-    """A PNG within the page.
-
-    Raises:
-        ValueError: the file is no PNG.
-    """
-    content = path.read_bytes()
-    if not content.startswith(b"\x89PNG"):
-        raise ValueError(f"{path} is not a PNG; a page shows PNG pictures.")
-    data = base64.b64encode(content).decode("ascii")
-    return element("figure", Html(f'<img alt="{html(path.stem)}" src="data:image/png;base64,{data}">'))
+        lacks = f"lacks {error}" if isinstance(error, KeyError) else f"has an entry of another kind ({error})"
+        raise ValueError(
+            f"{folder / name / 'summary.json'} {lacks}; run python -m recipes.{name} output={folder / name} again, "
+            "with its other options as before."
+        ) from error

@@ -126,7 +126,7 @@ def sensitivity_section(found: Mapping[str, Any]) -> Section:
         ),
     ]  # fmt: skip
     columns = {"correlation": "Spearman", "overlap": "same nearest quarter", "turned": "pairs turned round"}
-    seconds = found.get("seconds", {})
+    seconds = found["seconds"]
     rows = [
         [name, *(_plain(values[key]) for key in columns), number(seconds.get(name), 3)]
         for name, values in variants.items()
@@ -177,8 +177,8 @@ def discriminator_section(found: Mapping[str, Any]) -> Section:
         gallery(charts),
         table(head, rows),
         hint(
-            "How much more by smoothness than by the preference distance: "
-            f"{_text(found['smoothness_minus_distance'])}. Share of rollouts below the log: by the discriminator "
+            "How much more strongly by jerk than by the preference distance: "
+            f"{_text(found['jerk_minus_distance'])}. Share of rollouts below the log: by the discriminator "
             f"{chance['discriminator']}, by jerk alone {chance['jerk']}. "
             f"Held-out AUC for each policy: {', '.join(held_out)}."
         ),

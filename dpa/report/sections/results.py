@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from dpa.report.charts import Chart, Difference, Line, curves, forest, gallery, lines
-from dpa.report.experiment import Comparison, Experiment, decoding_of, in_words
+from dpa.report.experiment import Comparison, Experiment, decoding_against, decoding_of, in_words
+from dpa.report.findings import budgets, chosen_on_the_same, left_out, ordering
 from dpa.report.markup import (
     Html,
     Section,
@@ -16,17 +17,17 @@ from dpa.report.markup import (
     facts,
     folded,
     hint,
-    html,
-    interval,
     joined,
     sources,
+    stacked,
     table,
     tabs,
 )
+from dpa.report.paired import paired_figure, quiet_change
 from dpa.report.sections.likelihood import likelihood_table
-from dpa.report.sections.safety import safety_table
+from dpa.report.sections.safety import safety_tables
 from dpa.report.sections.scaling import scaling_charts
-from dpa.report.study import Evaluations
+from dpa.report.study import FIRST, Evaluations
 from dpa.report.table import COLUMNS, DIFFERENCE_TITLE, MISSING, REFERENCE, duration, number, signed
 
 MAIN = ("kinematic", "interactive", "map_based", "realism", "min_ade")
@@ -46,9 +47,15 @@ def experiment_section(experiment: Experiment, colours: Mapping[str, str], evalu
         OWN_BEST: _panel(experiment, experiment.own_best, evaluations),
         COMMON: _panel(experiment, experiment.at_common, evaluations),
     }
-    charts = [differences(experiment), *scaling_charts(experiment, colours), *matched_curves(experiment, colours)]
+    charts = [
+        differences(experiment),
+        versus(experiment),
+        *scaling_charts(experiment, colours),
+        *matched_curves(experiment, colours),
+    ]
     about = [
         _scenes(experiment),
+        f"numbers are of the {experiment.reported}",
         f"seeds {', '.join(map(str, experiment.seeds))}",
         f"realism metric of {experiment.metric}",
         *([f"in the paper: {experiment.paper}"] if experiment.paper else []),
@@ -57,8 +64,9 @@ def experiment_section(experiment: Experiment, colours: Mapping[str, str], evalu
         element("p", experiment.question, class_="question"),
         hint("; ".join(about) + "."),
         tabs(panels, f"decoding-{experiment.name}"),
+        *(element("p", note, class_="note") for note in (_which_loss(experiment), budgets(experiment)) if note),
         gallery([chart for chart in charts if chart is not None]),
-        likelihood_table(experiment),
+        likelihood_table(experiment, evaluations),
         folded("command, configuration, versions and machine", _made(experiment)),
     ]
     return Section(f"experiment-{experiment.name}", experiment.title, joined(body))
@@ -66,19 +74,32 @@ def experiment_section(experiment: Experiment, colours: Mapping[str, str], evalu
 
 def differences(experiment: Experiment) -> Chart | None:
     """Forest of paired differences at both decodings; None where nothing was compared."""
+    own, common = experiment.own_best, experiment.at_common
     groups = {
-        "own best": _differences(experiment, experiment.own_best, experiment.chosen.get(REFERENCE)),
-        "common": _differences(experiment, experiment.at_common, experiment.common),
+        "own best": _differences(experiment, own, own.paired),
+        "common": _differences(experiment, common, common.paired),
     }
     groups = {kind: found for kind, found in groups.items() if found}
     if not groups:
         return None
     caption = (
-        "Paired scene by scene; blue is better, orange worse, grey not told apart. Full: own best decodings. Hollow: "
-        "the common decoding, where the reference at other decodings shows what sampling alone does."
+        f"Paired scene by scene on {experiment.reported}; blue is better, orange worse, grey not told apart. Full: own "
+        "best decodings. Hollow: the common decoding, where the reference at other decodings shows what sampling alone "
+        "does."
     )
     title = "Realism minus that of the reference, 95 % intervals"
     return forest(groups, title, x="difference in realism", caption=caption)
+
+
+def versus(experiment: Experiment) -> Chart | None:
+    """Forest of the other methods against the headline's; None where there is no other."""
+    found = _differences(experiment, experiment.own_best, experiment.own_best.versus)
+    if not found:
+        return None
+    headline = experiment.labels[experiment.headline]
+    caption = f"Each at its own best decoding, on {experiment.reported}. Against {headline}, {ordering(experiment)}."
+    title = f"Realism minus that of {headline}, 95 % intervals"
+    return forest({"own best": found}, title, x=f"difference in realism to {headline}", caption=caption)
 
 
 def matched_curves(experiment: Experiment, colours: Mapping[str, str]) -> list[Chart]:
@@ -90,7 +111,7 @@ def matched_curves(experiment: Experiment, colours: Mapping[str, str]) -> list[C
         known.sort(key=lambda record: record["spread"])
         if not known:
             continue
-        label, chosen = experiment.label(method), experiment.chosen.get(method)
+        label, chosen = experiment.labels[method], experiment.chosen.get(method)
         content.append(
             Line(
                 label,
@@ -121,51 +142,79 @@ def matched_curves(experiment: Experiment, colours: Mapping[str, str]) -> list[C
 
 
 def _panel(experiment: Experiment, comparison: Comparison, evaluations: Evaluations) -> Html:
-    parts = [_main_table(experiment, comparison), safety_table(experiment, comparison, evaluations)]
+    parts = [_main_table(experiment, comparison, evaluations), safety_tables(experiment, comparison, evaluations)]
     return joined(part for part in parts if part)
 
 
-def _main_table(experiment: Experiment, comparison: Comparison) -> Html:
-    records = _ordered(experiment, comparison)
+def _main_table(experiment: Experiment, comparison: Comparison, evaluations: Evaluations) -> Html:
     columns = [column for column in COLUMNS if column.key in MAIN]
+    against = {entry["method"]: entry for entry in comparison.versus}
     head = ["method", "decoding", *(f"{column.title}\N{NO-BREAK SPACE}{column.better}" for column in columns)]
-    head += [DIFFERENCE_TITLE, "seeds"]
-    rows, shown = [], set()
-    for record in records:
-        method = record["method"]
+    head += [DIFFERENCE_TITLE, *([f"Δ to {experiment.labels[experiment.headline]}"] if against else []), "seeds"]
+    rows, shown, base = [], set(), comparison.base()
+    for record in _ordered(experiment, comparison):
+        method, mine = record["method"], comparison.of(record["method"], decoding_of(record))
         # The paper has one decoding for each method: its numbers stand at the first row only.
         published = {} if method in shown else experiment.published.get(method, {})
         shown.add(method)
-        cells = [_beside(number(record[c.key], c.digits), published.get(c.key), c.digits) for c in columns]
-        files = [row["file"] for row in comparison.of(method, decoding_of(record))]
-        change = interval(record["realism_difference"], record["ci95"])
-        rows.append([experiment.label(method), in_words(decoding_of(record)), *cells, change, sources(files)])
-    quiet = " In grey: the paper's numbers, from its own data and scale." if experiment.published else ""
-    note = (
-        f"Means over seeds on {experiment.scenes['eval']} evaluation scenes; Δ in bold where its interval does not "
-        f"contain 0; arrows point to better values.{quiet}"
+        cells = []
+        for column in columns:
+            # Realism has its difference in a column of its own.
+            alone = mine == base or column.key == "realism"
+            found = None if alone else paired_figure(mine, base, column.key, evaluations)
+            parts = [number(record[column.key], column.digits), quiet_change(found, column.digits)]
+            cells.append(joined([*parts, _paper(published.get(column.key), column.digits)], ""))
+        cells.append(stacked(record["realism_difference"], record["ci95"]))
+        if against:
+            entry = against.get(method, {})
+            cells.append(stacked(entry.get("realism_difference"), entry.get("ci95")))
+        where = in_words(decoding_of(record))
+        rows.append([experiment.labels[method], where, *cells, sources([row["file"] for row in mine])])
+    return joined([table(head, rows), hint(" ".join(_remarks(experiment, comparison)))])
+
+
+def _paper(published: float | None, digits: int) -> Html:
+    return Html("") if published is None else element("small", f"paper {number(published, digits)}")
+
+
+def _remarks(experiment: Experiment, comparison: Comparison) -> list[str]:
+    """How to read a table of results."""
+    own = comparison is experiment.own_best
+    remarks = [
+        f"Means over seeds on {experiment.reported}; arrows point to better values. Δ, and in small type below the "
+        "other values, is the difference from the reference with its 95 % interval, bold where that does not contain "
+        "0.",
+        "The paper's numbers are from its own data and scale." if experiment.published else None,
+        left_out(experiment),
+        chosen_on_the_same(experiment) if own else None,
+    ]
+    return [remark for remark in remarks if remark]
+
+
+def _which_loss(experiment: Experiment) -> str | None:
+    """What stands behind the name of the paper's method in the main experiment, as it was run."""
+    loss = experiment.config.get("methods", {}).get("dpa_omf", {}).get("loss", {})
+    if experiment.name != FIRST or not loss.get("reference"):
+        return None
+    return (
+        f"{experiment.labels['dpa_omf']} here is eq. 4 with the reference term, which is DPO. The plain form that the "
+        "paper writes is the method cpl of the experiment losses (docs/method.md)."
     )
-    return joined([table(head, rows), hint(note)])
 
 
-def _beside(text: str, published: float | None, digits: int) -> Html:
-    if published is None:
-        return html(text)
-    return joined([text, element("small", number(published, digits), title="published")], "")
-
-
-def _differences(experiment: Experiment, comparison: Comparison, base: Any) -> dict[str, Difference]:
+def _differences(
+    experiment: Experiment, comparison: Comparison, entries: Sequence[Mapping[str, Any]]
+) -> dict[str, Difference]:
     found = {}
-    for entry in _in_order(experiment, comparison.paired):
-        method, decoding = entry["method"], decoding_of(entry)
-        against = (float(entry["against_top_p"]), float(entry["against_temperature"]))
-        seeds = _by_seed(comparison, method, decoding, against)
-        name = experiment.label(method) + (f",\n{in_words(decoding)}" if method == REFERENCE else "")
+    for entry in _in_order(experiment, entries):
+        method, decoding, against = entry["method"], decoding_of(entry), decoding_against(entry)
+        seeds = _by_seed(comparison, method, decoding, entry["against"], against)
+        name = experiment.labels[method] + (f",\n{in_words(decoding)}" if method == REFERENCE else "")
         found[name] = Difference(
             entry["realism_difference"],
             *entry["ci95"],
             hover=[
-                f"{in_words(decoding)}, against the reference at {in_words(against)}",
+                f"{in_words(decoding)}, against {_called(experiment, entry['against'])} at {in_words(against)}",
                 f"{entry['n_seeds']} seeds, interval over {entry['over']}",
                 *([f"by seed: {', '.join(map(signed, seeds))}"] if seeds else []),
             ],
@@ -173,9 +222,13 @@ def _differences(experiment: Experiment, comparison: Comparison, base: Any) -> d
     return found
 
 
-def _by_seed(comparison: Comparison, method: str, decoding: Any, against: Any) -> list[float]:
+def _called(experiment: Experiment, method: str) -> str:
+    return "the reference" if method == REFERENCE else experiment.labels[method]
+
+
+def _by_seed(comparison: Comparison, method: str, decoding: Any, other: str, against: Any) -> list[float]:
     """Difference of the means of each seed, where both rows stand in the comparison."""
-    base = {row["seed"]: row.get("realism") for row in comparison.of(REFERENCE, against)}
+    base = {row["seed"]: row.get("realism") for row in comparison.of(other, against)}
     mine = {row["seed"]: row.get("realism") for row in comparison.of(method, decoding)}
     return [mine[seed] - base[seed] for seed in mine if None not in (mine[seed], base.get(seed))]
 
@@ -195,14 +248,27 @@ def _scenes(experiment: Experiment) -> str:
 
 
 def _made(experiment: Experiment) -> Html:
-    """Command, versions and configuration of an experiment."""
+    """Command, budgets, versions and configuration of an experiment."""
     named = {
         "numbers": element("code", f"experiments/{experiment.path.name}"),
         "date": experiment.date or MISSING,
+        "code": element("code", experiment.revision) if experiment.revision else MISSING,
         "machine": experiment.machine or MISSING,
-        "wall time": duration(experiment.wall_seconds),
+        "worker time": duration(experiment.worker_seconds),
         "stages": ", ".join(f"{name} {duration(spent)}" for name, spent in experiment.stages.items()) or MISSING,
         "versions": ", ".join(f"{name} {version}" for name, version in experiment.versions.items()),
     }
     config = json.dumps(experiment.config, indent=2, ensure_ascii=False, allow_nan=False)
-    return joined([command(experiment.command), facts(named), folded("configuration", element("pre", config))])
+    parts = [command(experiment.command), facts(named), _budget(experiment)]
+    return joined([*parts, folded("configuration", element("pre", config))])
+
+
+def _budget(experiment: Experiment) -> Html:
+    rows = [
+        [experiment.labels[method], f"{each['steps']:,}", f"{each['rollouts']:,}", experiment.labels[each["start"]]]
+        for method, each in experiment.budget.items()
+    ]
+    if not rows:
+        return Html("")
+    about = hint("Of one training run; a further round counts those of the method that it starts from.")
+    return joined([table(["method", "optimiser steps", "rollouts read", "starts from"], rows), about])

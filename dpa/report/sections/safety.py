@@ -1,27 +1,25 @@
-"""Safety of an experiment's methods, in measures that share nothing with the features of the preference distance."""
+"""Safety of an experiment's methods: what neither the ranking nor the metric sees, and apart from it what both see."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
-
-import numpy as np
+from collections.abc import Mapping
 
 from dpa.report.experiment import Comparison, Experiment, decoding_of, in_words
 from dpa.report.markup import Html, element, hint, joined, table
-from dpa.report.statistics import Interval, paired_bootstrap
+from dpa.report.paired import paired_figure, quiet_change
 from dpa.report.study import Evaluations
-from dpa.report.table import REFERENCE, number, signed
+from dpa.report.table import REFERENCE, number
 
-SAFETY = {
-    "collision_rate": "collision", "offroad_rate": "off-road", "wrong_way": "wrong way", "red_light": "red light",
-    "close_pass": "close pass", "harsh_jerk": "harsh jerk",
+UNSEEN = {
+    "wrong_way": "wrong way", "red_light": "red light", "close_pass": "close pass", "harsh_jerk": "harsh jerk",
 }  # fmt: skip
-RESAMPLES = 2_000
-"""Draws for an interval: its ends are read to two digits."""
+SEEN = {"collision_rate": "collision", "offroad_rate": "off-road"}
+"""In the features of the preference distance, and in the metric."""
+RED_LIGHTS = "2025"
+"""The metrics of this year weigh driving through red lights (dpa/realism/config)."""
 
 
-def safety_table(experiment: Experiment, comparison: Comparison, evaluations: Evaluations) -> Html:
+def safety_tables(experiment: Experiment, comparison: Comparison, evaluations: Evaluations) -> Html:
     """Rates of every method, and their paired differences from the reference where the scenes' values are there.
 
     Args:
@@ -29,73 +27,40 @@ def safety_table(experiment: Experiment, comparison: Comparison, evaluations: Ev
         comparison: one of its two.
         evaluations: figures of every scene.
     """
-    records = [record for method in experiment.methods for record in comparison.records() if record["method"] == method]
-    measured = [key for key in SAFETY if any(record.get(key) is not None for record in records)]
-    if not measured:
+    unseen, weighed = dict(UNSEEN), {}
+    if experiment.metric.startswith(RED_LIGHTS):
+        weighed = {"red_light": unseen.pop("red_light")}
+    groups = (
+        ("Safety: in neither the preference distance nor the metric", unseen),
+        (f"Safety: not in the preference distance, but in the metric of {experiment.metric}", weighed),
+        ("Safety: in both the preference distance and the metric", SEEN),
+    )
+    shown = [(title, found) for title, keys in groups if (found := _table(experiment, comparison, evaluations, keys))]
+    if not shown:
         return Html("")
-    base = _base(comparison, experiment)
-    rows = []
+    note = (
+        f"Means over seeds and {experiment.reported}. Below each its difference from the reference, with a 95 % "
+        "interval over the scenes where all have a value; bold where the interval does not contain 0."
+    )
+    return joined([*(joined([element("h3", title), found]) for title, found in shown), hint(note)])
+
+
+def _table(
+    experiment: Experiment, comparison: Comparison, evaluations: Evaluations, keys: Mapping[str, str]
+) -> Html | None:
+    """One group of measures; None where nothing of it was measured."""
+    records = [record for method in experiment.methods for record in comparison.records() if record["method"] == method]
+    measured = [key for key in keys if any(record.get(key) is not None for record in records)]
+    if not measured:
+        return None
+    base, rows = comparison.base(), []
     for record in records:
         mine = comparison.of(record["method"], decoding_of(record))
-        cells = []
+        name, cells = experiment.labels[record["method"]], []
         for key in measured:
-            found = None if mine == base else paired_rate(mine, base, key, evaluations)
-            cells.append(joined([number(record.get(key), 3), _change(found)], ""))
-        name = experiment.label(record["method"])
+            found = None if mine == base else paired_figure(mine, base, key, evaluations)
+            cells.append(joined([number(record.get(key), 3), quiet_change(found)], ""))
         if record["method"] == REFERENCE and mine != base:
             name += f", {in_words(decoding_of(record))}"
         rows.append([name, *cells])
-    return joined(
-        [
-            element("h3", "Safety"),
-            table(["method", *(f"{SAFETY[key]}\N{NO-BREAK SPACE}↓" for key in measured)], rows),
-            hint(
-                "Means over seeds and scenes. Below each its difference from the reference, with a 95 % interval over "
-                "the scenes where all have a value; bold where the interval does not contain 0."
-            ),
-        ]
-    )
-
-
-def paired_rate(
-    mine: Sequence[Mapping[str, Any]], base: Sequence[Mapping[str, Any]], key: str, evaluations: Evaluations
-) -> Interval | None:
-    """A figure minus that of the reference, paired by seed and scene.
-
-    Args:
-        mine: rows of a method, one for each seed.
-        base: rows of the reference.
-        key: of the figure.
-        evaluations: figures of every scene.
-
-    Returns:
-        Over the scenes where all rows have a value; None where a file or the figure is missing, or no scene is left.
-    """
-    by_seed = {row["seed"]: row for row in base}
-    if not mine or any(row["seed"] not in by_seed for row in mine):
-        return None
-    values = []
-    for rows in (mine, [by_seed[row["seed"]] for row in mine]):
-        found = [evaluations(row["file"]) for row in rows]
-        if any(scenes is None or key not in scenes for scenes in found):
-            return None
-        values.append([scenes[key] for scenes in found])
-    if len({len(scenes) for side in values for scenes in side}) != 1:
-        return None
-    both = np.array(values, dtype=float)
-    both = both[:, :, ~np.isnan(both).any((0, 1))]
-    return None if both.shape[-1] == 0 else paired_bootstrap(both[0], both[1], RESAMPLES)
-
-
-def _change(found: Interval | None) -> Html:
-    if found is None:
-        return Html("")
-    mean = element("strong", signed(found.mean)) if found.excludes_zero else signed(found.mean)
-    return element("small", mean, Html("<br>"), f"[{signed(found.low)}, {signed(found.high)}]")
-
-
-def _base(comparison: Comparison, experiment: Experiment) -> list[Mapping[str, Any]]:
-    """Rows of the reference that others are compared with."""
-    for entry in comparison.paired:
-        return comparison.of(REFERENCE, (float(entry["against_top_p"]), float(entry["against_temperature"])))
-    return comparison.of(REFERENCE, experiment.common)
+    return table(["method", *(f"{keys[key]}\N{NO-BREAK SPACE}↓" for key in measured)], rows)

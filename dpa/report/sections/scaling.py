@@ -44,7 +44,7 @@ def _against_axis(experiment: Experiment) -> list[Chart]:
                 means,
                 colour,
                 hover=[
-                    lines(f"{experiment.label(entry['method'])}, {kind}", *_told(entry), f"{axis.name}: {x:g}")
+                    lines(f"{experiment.labels[entry['method']]}, {kind}", *_told(entry), f"{axis.name}: {x:g}")
                     for entry in entries
                     for x in (axis.values[entry["method"]],)
                 ],
@@ -57,7 +57,7 @@ def _against_axis(experiment: Experiment) -> list[Chart]:
             )
         )
     title = f"Realism against {axis.name}"
-    caption = "Realism minus that of the reference, 95 % intervals (figure 7 left)."
+    caption = f"Realism minus that of the reference on {experiment.reported}, 95 % intervals (figure 7 left)."
     shown = {"x": axis.name, "y": "difference in realism", "caption": caption, "log_x": axis.log, "zero": True}
     return [curves(content, title, **shown)] if content else []
 
@@ -75,7 +75,7 @@ def _against_kl(experiment: Experiment, colours: Mapping[str, str]) -> list[Char
             own = comparison is experiment.own_best
             content.append(
                 Line(
-                    f"{experiment.label(base)}, {kind}",
+                    f"{experiment.labels[base]}, {kind}",
                     [0.0, *(kl[entry["method"]] for entry in found)],
                     [0.0, *(entry["realism_difference"] for entry in found)],
                     colours[base],
@@ -83,7 +83,7 @@ def _against_kl(experiment: Experiment, colours: Mapping[str, str]) -> list[Char
                         lines("reference"),
                         *(
                             lines(
-                                f"{experiment.label(entry['method'])}, {kind} decoding",
+                                f"{experiment.labels[entry['method']]}, {kind} decoding",
                                 *_told(entry),
                                 f"KL {number(kl[entry['method']], 3)}",
                             )
@@ -96,7 +96,7 @@ def _against_kl(experiment: Experiment, colours: Mapping[str, str]) -> list[Char
             )
     caption = (
         "Snapshots along each alignment, from the reference at the origin (figure 7 right). A line that bends down is "
-        "over-optimisation. KL on the evaluation scenes."
+        f"over-optimisation. Both on {experiment.reported}."
     )
     title = "Realism against the distance from the reference"
     shown = {"x": "KL to the reference", "y": "difference in realism", "caption": caption, "zero": True}

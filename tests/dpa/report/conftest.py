@@ -67,7 +67,7 @@ def comparison() -> dict[str, Any]:
         "per_scene": {},
         "seeds": [0, 1],
         "stages": {"pretrain": 3600.0, "align": 125.0},
-        "wall_seconds": 4000.0,
+        "worker_seconds": 4000.0,
         "versions": {"torch": "2.13.0"},
         "command": "python -m recipes.compare 'name=<b>'",
     }  # fmt: skip

@@ -8,12 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from omegaconf import OmegaConf
 
 from dpa.preferences.examples import example_groups, example_provenance
 from dpa.preferences.writer import PreferenceWriter
 from dpa.report.player import PlayerScene, pack_players
 from dpa.report.statistics import paired_bootstrap
 from envs.sources.synthetic import straight_road
+from recipes import discriminator as discriminator_recipe
+from recipes import sensitivity as sensitivity_recipe
+from recipes import spurious
+from recipes import validity as validity_recipe
+from recipes.study import as_json, how_made
 from tests.dpa.report.made_rollouts import judged, slower
 
 SEEDS = (0, 1, 2)
@@ -66,34 +72,45 @@ def write_runs(folder: Path) -> Path:
 
 def write_experiment(
     folder: Path, name: str, methods: list[str], *, headline: str = "dpa_omf", axis: dict[str, Any] | None = None,
-    published: dict[str, Any] | None = None,
+    published: dict[str, Any] | None = None, split: str = "eval",
 ) -> dict[str, Any]:  # fmt: skip
     """Write one experiment with the files behind its rows; returns its content."""
     chosen = dict.fromkeys(methods, BEST)
     others = [method for method in methods if method != "reference"]
     sharper = [("reference", decoding) for decoding in GRID if decoding != COMMON]
+    scenes = {"train": 8, "tune": 4, "eval": SCENES, "source": "made & up <by hand>"}
     content = {
-        "name": name, "title": f"Made-up {name}", "paper": "table 1", "question": "Is <this> a test?", "metric": "2024",
-        "scenes": {"train": 8, "tune": 4, "eval": SCENES, "source": "made & up <by hand>"}, "seeds": list(SEEDS),
-        "methods": methods, "labels": {m.partition("@")[0]: LABELS[m.partition("@")[0]] for m in methods},
+        "name": name, "title": f"Made-up {name}", "paper": "table 1" if published else None,
+        "question": "Is <this> a test?", "metric": "2024", "scenes": scenes | {split: SCENES}, "split": split,
+        "left_out": 0, "seeds": list(SEEDS), "methods": methods, "labels": {m: label(m) for m in methods},
         "published": published or {}, "headline": headline, "common": list(COMMON),
         "chosen": {method: list(decoding) for method, decoding in chosen.items()},
-        "rows": [row(folder, m, s, d) for m, d in [*((m, COMMON) for m in methods), *sharper] for s in SEEDS],
+        "rows": [row(folder, m, s, d, split) for m, d in [*((m, COMMON) for m in methods), *sharper] for s in SEEDS],
         "paired": [paired(m, d, COMMON) for m, d in [*((m, COMMON) for m in others), *sharper]],
         "own_best": {
-            "rows": [row(folder, method, seed, BEST) for method in methods for seed in SEEDS],
+            "rows": [row(folder, method, seed, BEST, split) for method in methods for seed in SEEDS],
             "paired": [paired(method, BEST, BEST) for method in others],
+            "versus": [paired(method, BEST, BEST, headline) for method in others if method != headline],
         },
         "tuning": [row(folder, m, s, d, split="tune") for m in methods for d in GRID for s in SEEDS],
-        "likelihood": [likelihood(method, seed) for method in methods for seed in SEEDS],
+        "likelihood": [likelihood(folder, method, seed, split) for method in methods for seed in SEEDS],
         "axis": axis,
         "curves": {m: {str(seed): curves(folder, m, seed) for seed in SEEDS} for m in others if "@" not in m},
-        "stages": {"pretrain": 5400.0, "align": 125.0}, "wall_seconds": 5525.0, "config": {"mark": "<!--{title}-->"},
-        "versions": {"torch": "2.13.0"}, "machine": "Linux x86_64, 2 CPU cores", "date": "2026-11-21",
+        "budget": {m: {"steps": 60, "rollouts": 960, "start": "reference"} for m in others if "@" not in m},
+        "stages": {"pretrain": 5400.0, "align": 125.0}, "worker_seconds": 5525.0,
+        "config": {"mark": "<!--{title}-->", "methods": {"dpa_omf": {"loss": {"reference": True}}}},
+        "revision": "0123abc", "versions": {"torch": "2.13.0"},
+        "machine": "Linux x86_64, 2 CPU cores", "date": "2026-11-21",
         "command": f"python -m recipes.compare experiment={name} 'name=<b>'",
     }  # fmt: skip
     write(folder / "experiments" / f"{name}.json", content)
     return content
+
+
+def label(method: str) -> str:
+    """A snapshot's has its step, as recipes.summary writes it."""
+    base, _, step = method.partition("@")
+    return LABELS[base] + (f" @ {step}" if step else "")
 
 
 def values(method: str, seed: int, decoding: tuple[float, float]) -> dict[str, list[float]]:
@@ -126,27 +143,38 @@ def row(folder: Path, method: str, seed: int, decoding: tuple[float, float], spl
     return identity | {"n_scenes": SCENES, "pair_accuracy": 0.6, **mean}
 
 
-def paired(method: str, decoding: tuple[float, float], against: tuple[float, float]) -> dict[str, Any]:
-    """Realism of a method minus that of the reference."""
-    sides = [(method, decoding), ("reference", against)]
+def paired(
+    method: str, decoding: tuple[float, float], against: tuple[float, float], other: str = "reference"
+) -> dict[str, Any]:
+    """Realism of a method minus that of another one."""
+    sides = [(method, decoding), (other, against)]
     mine, base = ([values(name, seed, at)["realism"] for seed in SEEDS] for name, at in sides)
     found = paired_bootstrap(mine, base, 500)
     return {
-        "method": method, "top_p": decoding[0], "temperature": decoding[1], "against": "reference",
+        "method": method, "top_p": decoding[0], "temperature": decoding[1], "against": other,
         "against_top_p": against[0], "against_temperature": against[1], "realism_difference": found.mean,
         "ci95": [found.low, found.high], "over": found.over, "n_seeds": found.num_seeds,
     }  # fmt: skip
 
 
-def likelihood(method: str, seed: int) -> dict[str, Any]:
-    """Likelihood of ranked rollouts."""
+def likelihood(folder: Path, method: str, seed: int, split: str = "eval") -> dict[str, Any]:
+    """Likelihood of ranked rollouts, and the file behind it."""
+    file, per_scene = f"seed_{seed}/{method}/likelihood_{split}.json", likelihoods(method)
+    mean = {figure: math.fsum(scenes) / len(scenes) for figure, scenes in per_scene.items()}
+    write(folder / file, {"options": {}, "mean": mean, "scenes": ["s"] * SCENES, "per_scene": per_scene})
+    return {"method": method, "seed": seed, "file": file, **mean}
+
+
+def likelihoods(method: str) -> dict[str, list[float]]:
+    """Likelihood in every scene: the same difference from the reference in each."""
     learns = method.startswith("dpa_omf")
-    return {
-        "method": method, "seed": seed, "file": f"seed_{seed}/{method}/likelihood_eval.json",
+    level = {
         "pair_accuracy": 0.65 if learns else 0.51, "nll_demonstration": 4.0, "nll_preferred": 2.0 - 0.3 * learns,
         "nll_unpreferred": 2.1 + 0.4 * learns, "entropy": 1.9,
         "kl": 0.0 if method == "reference" else 0.3 * float(method.partition("@")[2] or 60) / 60,
     }  # fmt: skip
+    scene = np.linspace(-0.1, 0.1, SCENES) * (method != "reference")
+    return {figure: (mean + (scene if figure == "kl" else 0 * scene)).tolist() for figure, mean in level.items()}
 
 
 def curves(folder: Path, method: str, seed: int) -> str:
@@ -169,53 +197,66 @@ def curves(folder: Path, method: str, seed: int) -> str:
     return run
 
 
-def value(mean: float, half: float = 0.05) -> dict[str, Any]:
-    """An interval as the studies of rankings write it."""
-    return {"mean": mean, "ci95": [mean - half, mean + half], "scenes": SCENES}
+ROLLOUTS = 16
+"""Of a scene of the studies of rankings."""
+
+
+def made(recipe: str, measured: dict[str, list[dict]]) -> dict[str, Any]:
+    """How a study says that it was made."""
+    return how_made(OmegaConf.create({"seed": 0, "num_rollouts": ROLLOUTS}), recipe, ["s"] * SCENES, measured)
 
 
 def validity() -> dict[str, Any]:
-    """Two rankings in four windows."""
-    places = (0.8, 0.95, 1.05, 1.2)
-    rankings = {
-        name: {
-            "correlation": value(-slope), "near_half": value(-slope / 2), "nearest": value(slope / 20),
-            "farthest": value(-slope / 20), "distance": [value(place) for place in places],
-            "realism": [value(slope * (1 - place) / 10, 0.01) for place in places],
-        }
-        for name, slope in (("omf", 0.7), ("ade", 0.4))
-    }  # fmt: skip
+    """Two rankings in four windows; realism falls with the distance."""
+    draw, measured = np.random.default_rng(0), []
+    for _ in range(SCENES):
+        scene: dict[str, Any] = {"random": {"realism": [0.6, 0.61]}}
+        for name, slope in (("omf", 0.05), ("ade", 0.02)):
+            distance = np.sort(draw.uniform(0.5, 1.5, 4))
+            realism = 0.6 + slope * (1 - distance) + draw.normal(0, 0.01, 4)
+            scene[name] = {"distance": distance.tolist(), "realism": realism.tolist()}
+        measured.append(scene)
+    policies = {"0": measured}
     return {
-        "rankings": rankings,
+        "rankings": as_json(validity_recipe.summarise(policies)),
         "minus": "ade",
-        "differences": {"omf": {"nearest": value(0.02), "farthest": value(-0.02)}},
+        "differences": as_json(validity_recipe.compare_with(policies, "ade")),
+        "made": made("validity", policies),
     }
 
 
 def sensitivity() -> dict[str, Any]:
-    """Two variants."""
-    names = ("ade", "time-aligned")
-    return {
-        "variants": {name: {"correlation": value(0.6), "overlap": value(0.5), "turned": value(0.1)} for name in names},
-        "margins": {"0–2 %": dict.fromkeys(names, value(0.55)), "over 40 %": dict.fromkeys(names, value(0.95))},
-        "rollouts": {size: {"margin": value(0.3), "ade_agrees": value(0.7)} for size in ("8", "16")},
-        "seconds": {"paper": 1.0, "time-aligned": 0.4},
-        "made": {"command": "python -m recipes.sensitivity policies=[a.pt]", "config": {"seed": 0}},
-    }  # fmt: skip
+    """Two variants of a distance."""
+    draw, measured = np.random.default_rng(1), []
+    for _ in range(SCENES):
+        base = draw.uniform(1, 3, ROLLOUTS)
+        others = {name: base + draw.normal(0, 0.3, ROLLOUTS) for name in ("ade", "time-aligned")}
+        distances = {name: value.tolist() for name, value in ({"paper": base} | others).items()}
+        measured.append({"distance": distances, "seconds": {"paper": 1.0, "time-aligned": 0.4}})
+    variants = sensitivity_recipe.Variants({"0": measured}, "paper")
+    found = as_json(sensitivity_recipe.summarise(variants))
+    return found | {"seconds": variants.seconds, "made": made("sensitivity", {"0": measured})}
 
 
 def discriminator() -> dict[str, Any]:
-    """One quantity that is ranked by, and one that nothing is known of."""
-    kinds = {"discriminator": -0.6, "distance": -0.2, "ade": -0.1, "random": 0.0}
-    quarters = {end: {"realism": value(gain)} for end, gain in (("best", 0.01), ("worst", -0.01))}
-    return {
-        "labels": {"jerk": "mean squared jerk", "collision": "collision rate"},
-        "correlation": {"jerk": {kind: value(mean) for kind, mean in kinds.items()}, "collision": dict.fromkeys(kinds)},
-        "realism": dict.fromkeys(("discriminator", "distance", "ade"), quarters),
-        "policies": {"0": {"best": {"held_out_auc": 0.91}}},
-        "auc": {"discriminator": value(0.9), "jerk": value(0.8)},
-        "smoothness_minus_distance": value(0.4),
-    }  # fmt: skip
+    """A ranking by jerk, in scenes without a collision."""
+    draw, measured = np.random.default_rng(2), []
+    for _ in range(SCENES):
+        quantity = {name: draw.random(ROLLOUTS) for name in spurious.QUANTITIES}
+        quantity["collision"] = np.zeros(ROLLOUTS)
+        realism = {end: {"realism": 0.6 + draw.normal(gain, 0.01)} for end, gain in (("best", 0.01), ("worst", -0.01))}
+        measured.append(
+            {
+                "score": (-quantity["jerk"] + draw.normal(0, 0.1, ROLLOUTS)).tolist(),
+                "quantity": {name: value.tolist() for name, value in quantity.items()},
+                "log": {"score": 0.5, "jerk": 0.1, "jerk_2hz": 0.1},
+                "realism": dict.fromkeys(spurious.RANKINGS, realism) | {"random": {"realism": 0.6}},
+            }
+        )
+    policies = {"0": measured}
+    training = {"0": {"best": {"step": 4, "held_out_loss": 0.4, "held_out_auc": 0.91}, "curve": [], "scenes": 8}}
+    found = discriminator_recipe.summary_json(spurious.summarise(policies), training)
+    return found | {"made": made("discriminator", policies)}
 
 
 def players() -> dict[str, Any]:

@@ -31,8 +31,15 @@ def test_an_experiment_is_read_with_both_comparisons(file: Path) -> None:
     assert len(experiment.grid()) == 3
 
 
-def test_a_snapshot_is_called_by_its_method_and_step(file: Path) -> None:
-    assert read_experiment(file).label("dpa_omf@20") == "DPA-OMF, step 20"
+def test_an_experiment_that_repeats_nothing_of_the_paper_outside_a_repository_is_read(file: Path) -> None:
+    content = json.loads(file.read_text(encoding="utf-8"))
+    file.write_text(json.dumps(content | {"paper": None, "revision": None}), encoding="utf-8")
+    experiment = read_experiment(file)
+    assert experiment.paper is experiment.revision is None
+
+
+def test_the_scenes_that_numbers_are_of_are_told_in_words(file: Path) -> None:
+    assert read_experiment(file).reported == "12 evaluation scenes"
 
 
 def test_a_temperature_of_one_is_not_told() -> None:
@@ -53,7 +60,12 @@ def entry(name: str, **changes: Any) -> Broken:
         (without("common"), r"methods\.json has no common; make it again"),
         (lambda c: c.update(seeds=3), r"seeds must be list, got 3"),
         (lambda c: c.update(headline="other"), r"methods must hold 'reference' and the headline 'other'"),
-        (lambda c: c["labels"].pop("dpa_omf"), r"labels has no entry for 'dpa_omf'"),
+        (lambda c: c["labels"].pop("dpa_omf@20"), r"labels has no entry for 'dpa_omf@20'"),
+        (lambda c: c["budget"]["dpa_omf"].update(start="x"), r"labels has no entry for 'x'"),
+        (lambda c: c["budget"].update(dpa_omf={}), r"budget\.dpa_omf has no steps, rollouts, start"),
+        (lambda c: c.update(split="train"), r"split must be one of eval, tune, got 'train'"),
+        (lambda c: c["own_best"].pop("versus"), r"own_best has no versus"),
+        (lambda c: c["own_best"]["versus"][0].update(against="x"), r"versus\[0\] must be against 'dpa_omf', got 'x'"),
         (lambda c: c["chosen"].update(dpa_omf=[0.9]), r"of dpa_omf must be \[top_p, temperature\], got \[0\.9\]"),
         (entry("rows", method="x"), r"rows\[0\] is of 'x', which is none of methods"),
         (entry("rows", realism="high"), r"rows\[0\]: realism must be a number or null, got 'high'"),

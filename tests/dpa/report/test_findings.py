@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from dpa.report.experiment import Comparison, Experiment, read_experiment
-from dpa.report.findings import headline, reservations
+from dpa.report.experiment import Comparison, Experiment, in_words, read_experiment
+from dpa.report.findings import budgets, headline, ordering, reservations
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def with_difference(found: Experiment, **changes: Any) -> Experiment:
 def test_an_interval_above_zero_is_a_gain(found: Experiment) -> None:
     found = with_difference(found, realism_difference=0.018, ci95=[0.006, 0.03])
     assert headline(found) == (
-        "Each at its own best decoding, DPA-OMF is 0.018 more realistic than the reference on 12 scenes "
+        "Each at its own best decoding, DPA-OMF is 0.018 more realistic than the reference on 12 evaluation scenes "
         "(95 % interval [+0.006, +0.030])."
     )
 
@@ -55,10 +55,21 @@ def test_what_sampling_alone_does_is_said(found: Experiment) -> None:
 
 
 def test_a_decoding_at_the_edge_of_the_grid_is_said(found: Experiment) -> None:
-    assert any("edge of the 3 decodings tried: reference (top-p 0.85)" in note for note in reservations(found))
-    chosen = dict.fromkeys(found.methods, (0.9, 0.95))
-    tuning = [*found.tuning, *({**row, "top_p": 0.9, "temperature": 0.95} for row in found.tuning[:1])]
-    assert not any("edge" in note for note in reservations(dataclasses.replace(found, chosen=chosen, tuning=tuning)))
+    def told(*grid: tuple[float, float]) -> bool:
+        """Of a grid whose first decoding was chosen."""
+        tuning = [{**found.tuning[0], "top_p": top_p, "temperature": temperature} for top_p, temperature in grid]
+        chosen = dict.fromkeys(found.methods, grid[0])
+        notes = reservations(dataclasses.replace(found, chosen=chosen, tuning=tuning))
+        wanted = f"Chosen at the edge of the {len(grid)} decodings tried: reference ({in_words(grid[0])})"
+        assert any(note.startswith(wanted) for note in notes) == any("edge" in note for note in notes)
+        return any("edge" in note for note in notes)
+
+    assert told((0.8, 1.0), (0.9, 1.0), (1.0, 1.0))
+    assert told((0.9, 0.6), (0.9, 0.8), (0.9, 1.0), (1.0, 1.0))
+    assert not told((0.9, 1.0), (0.8, 1.0), (1.0, 1.0)), "it has both neighbours"
+    assert not told((1.0, 1.0), (0.8, 1.0), (0.9, 1.0)), "beyond top-p 1 there is nothing"
+    assert not told((0.9, 1.0), (0.9, 0.8)), "of two, either is the last"
+    assert not told((0.95, 0.8), (1.0, 1.0), (0.95, 1.0), (0.9, 1.0)), "its neighbours have another temperature"
 
 
 def test_a_single_decoding_is_said(found: Experiment) -> None:
@@ -73,13 +84,36 @@ def test_few_training_runs_are_said(found: Experiment) -> None:
 
 
 def test_the_number_of_comparisons_is_said(found: Experiment) -> None:
-    assert any(note.startswith("40 differences stand on this page") for note in reservations(found, 40))
+    assert any(note.startswith("40 differences of realism stand on this page") for note in reservations(found, 40))
+    assert any(note.startswith("10 differences") for note in reservations(found)), "3 at own best, 2 versus, 5 common"
+
+
+def test_scenes_without_realism_are_said(found: Experiment) -> None:
+    assert not any("no realism" in note for note in reservations(found))
+    notes = reservations(dataclasses.replace(found, left_out=2))
+    assert "Differences are over 10 of 12 evaluation scenes: on the others some run has no realism." in notes
+
+
+def test_methods_are_sorted_by_what_can_be_told_of_them_against_the_headlines(found: Experiment) -> None:
+    ends = {"dpa_adef": [-0.01, 0.01], "adversarial_afd": [0.01, 0.02]}
+    versus = [{**entry, "ci95": ends[entry["method"]]} for entry in found.own_best.versus]
+    own = dataclasses.replace(found.own_best, versus=versus)
+    assert ordering(dataclasses.replace(found, own_best=own)) == "better: adversarial AFD; not told apart: DPA-ADEF"
+
+
+def test_equal_budgets_are_not_spoken_of_and_others_are_grouped(found: Experiment) -> None:
+    assert budgets(found) is None
+    budget = {**found.budget, "dpa_adef": {"steps": 60, "rollouts": 480, "start": "reference"}}
+    budget["adversarial_afd"] = budget["dpa_adef"]
+    assert budgets(dataclasses.replace(found, budget=budget)) == (
+        "Budgets differ. Over that of DPA-OMF, DPA-ADEF, adversarial AFD: 0.5 times the rollouts."
+    )
 
 
 def test_nothing_compared_is_no_claim(found: Experiment) -> None:
     found = dataclasses.replace(found, own_best=Comparison([], []))
     assert headline(found).startswith("No claim")
-    assert reservations(found)[-1].startswith("Scores on 12 scenes")
+    assert reservations(found)[-1].startswith("Scores on 12 evaluation scenes")
 
 
 if __name__ == "__main__":

@@ -11,18 +11,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from dpa.report.charts import _rounded
 from dpa.report.page import write_study
-from dpa.report.sections.safety import RESAMPLES
+from dpa.report.paired import RESAMPLES
 from dpa.report.statistics import paired_bootstrap
 from dpa.report.study import read_study
-from dpa.report.table import difference, number
+from dpa.report.table import difference, number, signed
 from recipes import report as recipe
 from recipes.report import report
 from tests.dpa.report.parsed import Page
-from tests.dpa.report.runs import BEST, COMMON, SEEDS, values
+from tests.dpa.report.runs import BEST, COMMON, SEEDS, label, values, write_experiment
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +54,19 @@ def table(page: Page, *head: str) -> list[list[str]]:
 
 def clean(text: str) -> str:
     return text.replace("\N{NO-BREAK SPACE}", " ").replace("\N{NON-BREAKING HYPHEN}", "-")
+
+
+def stacked(mean: float, ci95: Any, digits: int = 3) -> str:
+    """A difference and its interval as a cell has them, one above the other."""
+    return f"{signed(mean, digits)}[{', '.join(signed(end, digits) for end in ci95)}]"
+
+
+def paired(key: str, method: str, other: str, decoding: tuple[float, float]) -> str:
+    """Difference of a figure with its interval, from the values of every scene."""
+    mine, base = (np.array([values(m, s, decoding)[key] for s in SEEDS], dtype=float) for m in (method, other))
+    known = ~np.isnan([*mine, *base]).any(0)
+    found = paired_bootstrap(mine[:, known], base[:, known], RESAMPLES)
+    return stacked(found.mean, (found.low, found.high))
 
 
 def figures(page: Page, axis: str) -> list[dict[str, Any]]:
@@ -97,7 +109,9 @@ def test_the_headline_has_the_difference_at_own_best_and_the_common_one_beside_i
         next(entry for entry in paired if entry["method"] == "dpa_omf")
         for paired in (methods["own_best"]["paired"], methods["paired"])
     )
-    assert f"DPA-OMF is {own['realism_difference']:.3f} more realistic than the reference on 12 scenes" in page.text
+    gain = f"{own['realism_difference']:.3f} more realistic than the reference on 12 evaluation scenes"
+    assert f"DPA-OMF is {gain}" in page.text
+    assert "of the experiment Made-up methods" in page.text
     for entry in (own, common):
         low, high = entry["ci95"]
         assert f"+{entry['realism_difference']:.3f} [+{low:.3f}, +{high:.3f}] realism, 95 %" in spaced(page)
@@ -112,24 +126,64 @@ def test_a_table_has_means_over_seeds_intervals_and_published_numbers(
     common: bool, page: Page, methods: dict[str, Any]
 ) -> None:
     tables = [rows for rows in page.tables if rows[0][:2] == ["method", "decoding"]]
-    rows, paired = (methods["rows"], methods["paired"]) if common else methods["own_best"].values()
+    of = methods if common else methods["own_best"]
+    rows, differences = of["rows"], of["paired"]
     decoding = COMMON if common else BEST
     cells = next(row for row in tables[int(common)] if row[0] == "DPA-OMF")
     assert cells[1] == f"top-p {decoding[0]:g}"
-    published = {"kinematic": "0.415", "realism": "0.739", "min_ade": "1.413"}
+    published = {"kinematic": "paper 0.415", "realism": "paper 0.739", "min_ade": "paper 1.413"}
     for cell, key in zip(cells[2:7], ("kinematic", "interactive", "map_based", "realism", "min_ade"), strict=True):
-        assert cell == number(mean(rows, "dpa_omf", key, decoding), 3) + published.get(key, ""), key
-    entry = next(entry for entry in paired if entry["method"] == "dpa_omf")
-    assert cells[7] == difference(entry["realism_difference"], entry["ci95"])
-    assert all(f"seed_{seed}/dpa_omf/eval_top_p_{decoding[0]:g}_t_1.json" in cells[8] for seed in SEEDS)
+        change = "" if key == "realism" else paired(key, "dpa_omf", "reference", decoding)
+        assert cell == number(mean(rows, "dpa_omf", key, decoding), 3) + change + published.get(key, ""), key
+    entry = next(entry for entry in differences if entry["method"] == "dpa_omf")
+    assert cells[7] == stacked(entry["realism_difference"], entry["ci95"])
+    assert all(f"seed_{seed}/dpa_omf/eval_top_p_{decoding[0]:g}_t_1.json" in cells[-1] for seed in SEEDS)
+
+
+def test_methods_are_compared_with_the_headlines_in_a_column_and_a_forest(page: Page, methods: dict[str, Any]) -> None:
+    head, *rows = next(rows for rows in page.tables if rows[0][:2] == ["method", "decoding"])
+    place = [clean(title) for title in head].index("Δ to DPA-OMF")
+    cells = {row[0]: row[place] for row in rows}
+    versus = {entry["method"]: entry for entry in methods["own_best"]["versus"]}
+    assert set(versus) == {"dpa_adef", "adversarial_afd"}
+    for method, entry in versus.items():
+        assert cells[label(method)] == stacked(entry["realism_difference"], entry["ci95"])
+    assert cells["reference"] == cells["DPA-OMF"] == "–"
+    forest = trace(figures(page, "difference in realism to DPA-OMF")[0], "own best")
+    assert forest["x"] == [_rounded(entry["realism_difference"]) for entry in versus.values()]
+    assert "against DPA-OMF at top-p 0.85" in forest["hovertext"][0] and "by seed: " in forest["hovertext"][0]
+    assert "Against DPA-OMF, worse: DPA-ADEF, adversarial AFD." in page.text
 
 
 def test_safety_is_paired_scene_by_scene_where_all_have_a_value(page: Page) -> None:
-    cells = next(row for row in table(page, "method", "collision ↓") if row[0] == "DPA-OMF")
-    assert len(cells) == 7
-    scenes = [[values(m, seed, BEST)["red_light"][1:] for seed in SEEDS] for m in ("dpa_omf", "reference")]
-    found = paired_bootstrap(*np.array(scenes, dtype=float), RESAMPLES)
-    assert cells[4].endswith(difference(found.mean, (found.low, found.high)).replace(" [", "["))
+    cells = next(row for row in table(page, "method", "wrong way ↓") if row[0] == "DPA-OMF")
+    assert len(cells) == 5
+    assert cells[2].endswith(paired("red_light", "dpa_omf", "reference", BEST))
+
+
+def test_safety_that_the_ranking_sees_stands_apart(page: Page) -> None:
+    assert [clean(cell) for cell in safety(page, "collision ↓")] == ["method", "collision ↓", "off-road ↓"]
+    assert "red light ↓" in map(clean, safety(page, "wrong way ↓"))
+    assert "Safety: in neither the preference distance nor the metric" in page.text
+
+
+def test_red_lights_stand_apart_where_the_metric_weighs_them(copied: Path, tmp_path: Path) -> None:
+    change(copied, "methods", metric="2025")
+    page = Page(report(copied, tmp_path / "out").read_text(encoding="utf-8"))
+    assert "Safety: not in the preference distance, but in the metric of 2025" in page.text
+    assert [clean(cell) for cell in safety(page, "red light ↓")] == ["method", "red light ↓"]
+    assert "red light ↓" not in map(clean, safety(page, "wrong way ↓"))
+
+
+def safety(page: Page, title: str) -> list[str]:
+    """Titles of the first table whose second column is this."""
+    return next(rows[0] for rows in page.tables if clean(rows[0][1]) == title)
+
+
+def change(runs: Path, name: str, **changes: Any) -> None:
+    """Other entries in an experiment's file."""
+    path = runs / "experiments" / f"{name}.json"
+    path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | changes), encoding="utf-8")
 
 
 def test_safety_without_the_files_behind_it_has_no_intervals(copied: Path, tmp_path: Path) -> None:
@@ -138,6 +192,8 @@ def test_safety_without_the_files_behind_it_has_no_intervals(copied: Path, tmp_p
     page = Page(report(copied, tmp_path / "out").read_text(encoding="utf-8"))
     cells = next(row for row in table(page, "method", "collision ↓") if row[0] == "DPA-OMF")
     assert all(re.fullmatch(r"\d\.\d{3}", cell) for cell in cells[1:])
+    cells = next(row for row in table(page, "method", "decoding") if row[0] == "DPA-OMF")
+    assert re.fullmatch(r"\d\.\d{3}", cells[3])
 
 
 def test_the_forest_holds_every_interval_with_its_seeds(page: Page, methods: dict[str, Any]) -> None:
@@ -164,15 +220,22 @@ def test_decoding_matched_curves_have_realism_over_spread_and_mark_the_chosen_de
 
 
 def test_table_3_has_pair_accuracy_realism_and_min_ade(page: Page, methods: dict[str, Any]) -> None:
-    first, second = table(page, "method", "pair accuracy ↑", "realism ↑")
+    first, second, to_afd, to_reference = table(page, "method", "pair accuracy ↑", "realism ↑")
     realism = number(mean(methods["rows"], "dpa_omf", "realism", COMMON), 3)
-    assert first[:3] == ["DPA-OMF", "0.6500.840", f"{realism}0.739"]
+    assert first[:3] == ["DPA-OMF", "0.650paper 0.840", f"{realism}paper 0.739"]
     assert second[:2] == ["adversarial AFD", "0.510"]
+    for cells, other in ((to_afd, "adversarial_afd"), (to_reference, "reference")):
+        assert cells[:2] == [f"DPA-OMF − {label(other)}", "+0.140[+0.140, +0.140]"]
+        assert cells[2:] == [paired(key, "dpa_omf", other, COMMON) for key in ("realism", "min_ade")]
 
 
 def test_likelihood_is_a_table_that_names_its_files(page: Page) -> None:
     cells = next(row for row in table(page, "method", "pair accuracy ↑", "NLL preferred") if row[0] == "DPA-OMF")
-    assert cells[1:7] == ["0.650", "1.70", "2.50", "4.00", "1.90", "0.30"]
+    assert cells[1:4] == ["0.650+0.140[+0.140, +0.140]", "1.70−0.30[−0.30, −0.30]", "2.50+0.40[+0.40, +0.40]"]
+    assert cells[4:6] == ["4.000.00[0.00, 0.00]", "1.900.00[0.00, 0.00]"]
+    scenes = np.tile(0.3 + np.linspace(-0.1, 0.1, 12), (3, 1))
+    kl = paired_bootstrap(scenes, 0 * scenes, RESAMPLES)
+    assert cells[6] == "0.30" + stacked(kl.mean, (kl.low, kl.high), 2)
     assert "seed_2/dpa_omf/likelihood_eval.json" in cells[7]
 
 
@@ -182,7 +245,10 @@ def test_likelihood_along_training_has_a_line_for_each_seed_and_their_mean(page:
     assert [each["line"]["width"] for each in lines] == [1, 1, 1, 2.6]
     assert lines[0]["y"][-1] == pytest.approx(1.8) and lines[3]["y"][-1] == pytest.approx(1.82)
     shown = {figure["layout"]["yaxis"]["title"]["text"] for figure in figures(page, "step")}
-    assert shown == {"negative log-likelihood", "train/logit_std", "train/saturated", "train/kl", "train/entropy"}
+    assert shown == {
+        "negative log-likelihood", "standard deviation of the logits", "share of pairs", "KL per token [nats]",
+        "entropy per token [nats]",
+    }  # fmt: skip
 
 
 def test_scaling_stands_over_its_axis_with_intervals(page: Page, runs: Path) -> None:
@@ -203,18 +269,39 @@ def test_snapshots_stand_over_their_distance_from_the_reference_in_order_of_step
     assert line["y"] == pytest.approx([0, *gains], rel=1e-4)
 
 
-def test_studies_of_rankings_are_figures_and_tables(page: Page) -> None:
-    (validity,) = figures(page, "distance over the scene's mean")
-    assert trace(validity, "omf")["y"] == pytest.approx([0.014, 0.0035, -0.0035, -0.014])
-    assert table(page, "ranking", "Spearman")[0][1] == "−0.700 [−0.750, −0.650]"
+def test_the_validity_of_a_distance_is_a_figure_and_a_table(page: Page, runs: Path) -> None:
+    omf = read(runs, "validity/summary.json")["rankings"]["omf"]
+    (figure,) = figures(page, "distance over the scene's mean")
+    assert trace(figure, "omf")["y"] == [_rounded(window["mean"]) for window in omf["realism"]]
+    assert table(page, "ranking", "Spearman")[0][1] == told(omf["correlation"])
+
+
+def test_what_options_change_is_a_figure_and_a_table(page: Page, runs: Path) -> None:
+    found = read(runs, "sensitivity/summary.json")
+    names = list(found["variants"])
     (heat,) = figures(page, "gap of the pair")
-    assert heat["data"][0]["z"] == [[0.55, 0.95], [0.55, 0.95]]
-    assert table(page, "variant", "Spearman")[1][1:] == [
-        "0.600 [0.550, 0.650]", "0.500 [0.450, 0.550]", "0.100 [0.050, 0.150]", "0.400",
-    ]  # fmt: skip
-    assert "python -m recipes.sensitivity policies=[a.pt]" in page.text
+    shares = [[margin[name]["mean"] for margin in found["margins"].values()] for name in names]
+    assert heat["data"][0]["z"] == _rounded(shares)
+    cells = {row[0]: row[1:] for row in table(page, "variant", "Spearman")}
+    variant = found["variants"]["time-aligned"]
+    means = [number(variant[key]["mean"], 3) for key in ("correlation", "overlap", "turned")]
+    assert [cell.split()[0] for cell in cells["time-aligned"]] == [*means, "0.400"]
+    assert "python -m recipes.sensitivity" in page.text
+
+
+def test_what_a_discriminator_ranks_by_is_a_table_with_the_answer_below(page: Page, runs: Path) -> None:
+    found = read(runs, "discriminator/summary.json")
+    rows = {row[0]: row[1:] for row in table(page, "within a scene", "discriminator")}
+    assert rows["collision rate"] == ["–"] * 4
+    assert rows["preference distance"][0] == told(found["correlation"]["distance"]["discriminator"])
+    answer = found["jerk_minus_distance"]
+    assert answer["ci95"][0] > 0
+    assert f"How much more strongly by jerk than by the preference distance: {told(answer)}." in page.text
     assert "Held-out AUC for each policy: 0 0.910." in page.text
-    assert table(page, "within a scene", "discriminator")[1] == ["collision rate", "–", "–", "–", "–"]
+
+
+def told(value: dict[str, Any]) -> str:
+    return difference(value["mean"], value["ci95"])
 
 
 def test_stages_cards_and_the_way_to_make_it_again_are_there(page: Page) -> None:
@@ -225,8 +312,42 @@ def test_stages_cards_and_the_way_to_make_it_again_are_there(page: Page) -> None
     assert hours["data"][0]["x"] == [1.5, 0.5]
     card = {name: cells for name, *cells in table(page, "store", "seed 0, train")}
     assert card["rollouts per scene"] == ["8", "8"] and "distance made of speed" in card
-    for wanted in ("recipes.compare experiment=methods", "torch 2.13.0", "Linux x86_64, 2 CPU cores", "2026-11-21"):
+    wanted = ("recipes.compare experiment=methods", "torch 2.13.0", "Linux x86_64, 2 CPU cores", "2026-11-21")
+    for each in (*wanted, "worker time1 h 32 min", "code0123abc"):
+        assert each in page.text
+    assert table(page, "method", "optimiser steps")[0] == ["DPA-OMF", "60", "960", "reference"]
+
+
+def test_methods_that_train_on_more_are_named(copied: Path, tmp_path: Path) -> None:
+    budget = read(copied, "experiments/methods.json")["budget"]
+    budget["dpa_adef"] |= {"steps": 120, "rollouts": 1920}
+    change(copied, "methods", budget=budget)
+    page = Page(report(copied, tmp_path / "out").read_text(encoding="utf-8"))
+    told = "Budgets differ. Over that of DPA-OMF, DPA-ADEF: 2 times the steps, 2 times the rollouts."
+    assert page.text.count(told) == 2  # at the top, and beside the tables
+
+
+def test_what_the_papers_method_is_here_is_said_below_its_table(page: Page, copied: Path, tmp_path: Path) -> None:
+    told = "DPA-OMF here is eq. 4 with the reference term, which is DPO."
+    assert page.text.count(told) == 1
+    change(copied, "methods", config={"methods": {"dpa_omf": {"loss": {"reference": False}}}})
+    assert told not in Page(report(copied, tmp_path / "out").read_text(encoding="utf-8")).text
+
+
+def test_an_experiment_on_the_tuning_scenes_says_so_everywhere(tmp_path: Path) -> None:
+    write_experiment(tmp_path, "settings", ["reference", "dpa_omf", "dpa_adef"], split="tune")
+    page = Page(report(tmp_path, tmp_path / "out").read_text(encoding="utf-8"))
+    assert "DPA-OMF is " in page.text, "the headline is of the first experiment where there is no 'methods'"
+    for wanted in (
+        "more realistic than the reference on 12 tuning scenes",
+        "numbers are of the 12 tuning scenes",
+        "Means over seeds on 12 tuning scenes",
+        "ranked rollouts of the 12 tuning scenes",
+        "Paired scene by scene on 12 tuning scenes",
+    ):
         assert wanted in page.text
+    assert "evaluation scenes" not in page.text.replace("8 training, 12 tuning and 12 evaluation scenes", "")
+    assert page.text.count("Decodings were chosen on these very tuning scenes") == 2
 
 
 def test_the_player_has_its_scenes(page: Page) -> None:
@@ -255,22 +376,30 @@ def test_what_is_missing_is_named_with_its_command(copied: Path, tmp_path: Path)
 def test_a_study_of_rankings_alone_makes_a_page_without_a_claim(copied: Path, tmp_path: Path) -> None:
     shutil.rmtree(copied / "experiments")
     page = Page(report(copied, tmp_path / "out").read_text(encoding="utf-8"))
-    assert "No claim: the study has no experiment 'methods'" in page.text
+    assert "No claim: the study has no experiment that compares methods." in page.text
     with pytest.raises(ValueError, match=r"holds no experiments/\*\.json, and p\.png is a picture of one"):
         report(copied, tmp_path / "p.png")
     assert table(page, "variant", "Spearman")
 
 
-def test_a_summary_that_lacks_an_entry_is_shown_by_its_picture_or_refused(copied: Path, tmp_path: Path) -> None:
-    (copied / "validity" / "summary.json").write_text("{}", encoding="utf-8")
-    with pytest.raises(
-        ValueError, match=r"validity/summary\.json lacks 'rankings'; run python -m recipes\.validity again"
-    ):
+@pytest.mark.parametrize(
+    ("name", "lacking", "told"),
+    [
+        ("validity", "rankings", "lacks 'rankings'"),
+        ("sensitivity", "made", "lacks 'made'"),
+        ("discriminator", "jerk_minus_distance", "lacks 'jerk_minus_distance'"),
+    ],
+)
+def test_a_summary_that_lacks_an_entry_is_refused_with_its_file_and_recipe(
+    name: str, lacking: str, told: str, copied: Path, tmp_path: Path
+) -> None:
+    path = copied / name / "summary.json"
+    content = read(copied, f"{name}/summary.json")
+    del content[lacking]
+    path.write_text(json.dumps(content), encoding="utf-8")
+    with pytest.raises(ValueError, match=rf"{re.escape(str(path))} {told}; run python -m recipes\.{name} output="):
         report(copied, tmp_path / "out")
-    Image.new("RGB", (4, 4)).save(copied / "validity" / "validity.png")
-    page = Page(report(copied, tmp_path / "out").read_text(encoding="utf-8"))
-    assert [value[:22] for tag, name, value in page.attributes if name == "src"] == ["data:image/png;base64,"]
-    assert "validity/summary.json lacks 'rankings': its pictures stand here" in page.text
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_broken_file_behind_a_number_is_named_and_the_old_page_is_kept(copied: Path, tmp_path: Path) -> None:

@@ -1,0 +1,56 @@
+"""Any figure of a method minus that of another one, scene by scene, from the files behind their rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from dpa.report.markup import Html, element
+from dpa.report.statistics import Interval, paired_bootstrap
+from dpa.report.study import Evaluations
+from dpa.report.table import signed
+
+RESAMPLES = 2_000
+"""Draws for an interval: its ends are read to two digits, and a page has hundreds of them."""
+
+
+def paired_figure(
+    mine: Sequence[Mapping[str, Any]], base: Sequence[Mapping[str, Any]], key: str, evaluations: Evaluations
+) -> Interval | None:
+    """A figure minus that of another method, paired by seed and scene.
+
+    Args:
+        mine: rows of a method, one for each seed, with their ``file``.
+        base: rows of the other.
+        key: of the figure.
+        evaluations: figures of every scene.
+
+    Returns:
+        Over the scenes where all rows have a value; None where a file or the figure is missing, the seeds are others,
+        or no scene is left.
+    """
+    by_seed = {row["seed"]: row for row in base}
+    if not mine or any(row["seed"] not in by_seed for row in mine):
+        return None
+    values = []
+    for rows in (mine, [by_seed[row["seed"]] for row in mine]):
+        found = [evaluations(row["file"]) for row in rows]
+        if any(scenes is None or key not in scenes for scenes in found):
+            return None
+        values.append([scenes[key] for scenes in found])
+    if len({len(scenes) for side in values for scenes in side}) != 1:
+        return None
+    both = np.array(values, dtype=float)
+    both = both[:, :, ~np.isnan(both).any((0, 1))]
+    return None if both.shape[-1] == 0 else paired_bootstrap(both[0], both[1], RESAMPLES)
+
+
+def quiet_change(found: Interval | None, digits: int = 3) -> Html:
+    """A difference below the value that it belongs to; nothing where there is none."""
+    if found is None:
+        return Html("")
+    mean = signed(found.mean, digits)
+    ends = f"[{signed(found.low, digits)}, {signed(found.high, digits)}]"
+    return element("small", element("strong", mean) if found.excludes_zero else mean, Html("<br>"), ends)
