@@ -130,6 +130,15 @@ def interval(mean: float | None, ci95: Sequence[float] | None) -> Html:
     return element("strong", text) if ci95 is not None and _apart(ci95) else html(text)
 
 
+def quiet(mean: float | None, ci95: Sequence[float] | None, digits: int = 3) -> Html:
+    """A difference with its interval below the value that it belongs to; nothing where there is none."""
+    if mean is None or ci95 is None:
+        return Html("")
+    ends = f"[{signed(ci95[0], digits)}, {signed(ci95[1], digits)}]"
+    text = signed(mean, digits)
+    return element("small", element("strong", text) if _apart(ci95) else text, Html("<br>"), ends)
+
+
 def stacked(mean: float | None, ci95: Sequence[float] | None) -> Html:
     """A difference above its interval, for a narrow column; otherwise as :func:`interval`."""
     if mean is None or ci95 is None:

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from dpa.report.markup import Html, element
+from dpa.report.markup import Html, quiet
 from dpa.report.statistics import Interval, paired_bootstrap
 from dpa.report.study import Evaluations
-from dpa.report.table import signed
 
 RESAMPLES = 2_000
 """Draws for an interval: its ends are read to two digits, and a page has hundreds of them."""
@@ -49,8 +48,4 @@ def paired_figure(
 
 def quiet_change(found: Interval | None, digits: int = 3) -> Html:
     """A difference below the value that it belongs to; nothing where there is none."""
-    if found is None:
-        return Html("")
-    mean = signed(found.mean, digits)
-    ends = f"[{signed(found.low, digits)}, {signed(found.high, digits)}]"
-    return element("small", element("strong", mean) if found.excludes_zero else mean, Html("<br>"), ends)
+    return quiet(None, None) if found is None else quiet(found.mean, (found.low, found.high), digits)

@@ -18,6 +18,7 @@ from dpa.report.markup import (
     folded,
     hint,
     joined,
+    quiet,
     sources,
     stacked,
     table,
@@ -28,7 +29,7 @@ from dpa.report.sections.likelihood import likelihood_table
 from dpa.report.sections.safety import safety_tables
 from dpa.report.sections.scaling import scaling_charts
 from dpa.report.study import FIRST, Evaluations
-from dpa.report.table import COLUMNS, DIFFERENCE_TITLE, MISSING, REFERENCE, duration, number, signed
+from dpa.report.table import COLUMNS, MISSING, REFERENCE, duration, number, signed
 
 MAIN = ("kinematic", "interactive", "map_based", "realism", "min_ade")
 """Figures of the first table, in the paper's order."""
@@ -60,11 +61,12 @@ def experiment_section(experiment: Experiment, colours: Mapping[str, str], evalu
         f"realism metric of {experiment.metric}",
         *([f"in the paper: {experiment.paper}"] if experiment.paper else []),
     ]
+    unequal = budgets(experiment)
     body = [
         element("p", experiment.question, class_="question"),
         hint("; ".join(about) + "."),
         tabs(panels, f"decoding-{experiment.name}"),
-        *(element("p", note, class_="note") for note in (_which_loss(experiment), budgets(experiment)) if note),
+        *([element("p", unequal, class_="note")] if unequal else []),
         gallery([chart for chart in charts if chart is not None]),
         likelihood_table(experiment, evaluations),
         folded("command, configuration, versions and machine", _made(experiment)),
@@ -149,8 +151,8 @@ def _panel(experiment: Experiment, comparison: Comparison, evaluations: Evaluati
 def _main_table(experiment: Experiment, comparison: Comparison, evaluations: Evaluations) -> Html:
     columns = [column for column in COLUMNS if column.key in MAIN]
     against = {entry["method"]: entry for entry in comparison.versus}
-    head = ["method", "decoding", *(f"{column.title}\N{NO-BREAK SPACE}{column.better}" for column in columns)]
-    head += [DIFFERENCE_TITLE, *([f"Δ to {experiment.labels[experiment.headline]}"] if against else []), "seeds"]
+    head = ["method", *(f"{column.title}\N{NO-BREAK SPACE}{column.better}" for column in columns)]
+    head += [*([f"Δ realism to {experiment.labels[experiment.headline]}"] if against else []), "seeds"]
     rows, shown, base = [], set(), comparison.base()
     for record in _ordered(experiment, comparison):
         method, mine = record["method"], comparison.of(record["method"], decoding_of(record))
@@ -159,18 +161,20 @@ def _main_table(experiment: Experiment, comparison: Comparison, evaluations: Eva
         shown.add(method)
         cells = []
         for column in columns:
-            # Realism has its difference in a column of its own.
-            alone = mine == base or column.key == "realism"
-            found = None if alone else paired_figure(mine, base, column.key, evaluations)
-            parts = [number(record[column.key], column.digits), quiet_change(found, column.digits)]
-            cells.append(joined([*parts, _paper(published.get(column.key), column.digits)], ""))
-        cells.append(stacked(record["realism_difference"], record["ci95"]))
+            if column.key == "realism":
+                change = quiet(record["realism_difference"], record["ci95"], column.digits)
+            else:
+                found = None if mine == base else paired_figure(mine, base, column.key, evaluations)
+                change = quiet_change(found, column.digits)
+            value, paper = number(record[column.key], column.digits), published.get(column.key)
+            cells.append(joined([value, change, _paper(paper, column.digits)], ""))
         if against:
             entry = against.get(method, {})
             cells.append(stacked(entry.get("realism_difference"), entry.get("ci95")))
-        where = in_words(decoding_of(record))
-        rows.append([experiment.labels[method], where, *cells, sources([row["file"] for row in mine])])
-    return joined([table(head, rows), hint(" ".join(_remarks(experiment, comparison)))])
+        name = joined([experiment.labels[method], element("small", in_words(decoding_of(record)))], "")
+        rows.append([name, *cells, sources([row["file"] for row in mine])])
+    note, remarks = _which_loss(experiment), hint(" ".join(_remarks(experiment, comparison)))
+    return joined([table(head, rows), *([element("p", note, class_="note")] if note else []), remarks])
 
 
 def _paper(published: float | None, digits: int) -> Html:
@@ -181,9 +185,8 @@ def _remarks(experiment: Experiment, comparison: Comparison) -> list[str]:
     """How to read a table of results."""
     own = comparison is experiment.own_best
     remarks = [
-        f"Means over seeds on {experiment.reported}; arrows point to better values. Δ, and in small type below the "
-        "other values, is the difference from the reference with its 95 % interval, bold where that does not contain "
-        "0.",
+        f"Means over seeds on {experiment.reported}; arrows point to better values. In small type the difference from "
+        "the reference with its 95 % interval, bold where that does not contain 0.",
         "The paper's numbers are from its own data and scale." if experiment.published else None,
         left_out(experiment),
         chosen_on_the_same(experiment) if own else None,

@@ -88,7 +88,7 @@ def test_a_tab_shows_its_table_and_hides_the_other(page: Any) -> None:
     assert [panel.is_visible() for panel in panels.all()] == [True, False]
     common.click()
     assert [panel.is_visible() for panel in panels.all()] == [False, True]
-    assert panels.nth(1).locator("tbody tr").first.inner_text().startswith("reference\ttop-p 0.95")
+    assert panels.nth(1).locator("tbody tr").first.inner_text().startswith("reference\ntop-p 0.95")
     common.press("ArrowLeft")
     assert own.get_attribute("aria-selected") == "true"
     assert [panel.is_visible() for panel in panels.all()] == [True, False]
