@@ -165,6 +165,8 @@ def forest(
             marker=_dot(shade, hollow=bool(place) and colours is None),
         )  # fmt: skip
     ends = [end for values in groups.values() for each in values.values() for end in (each.low, each.high)]
+    if colours is None:
+        ends.append(0.0)  # what a colour says is read off 0
     room = 0.06 * (max(ends) - min(ends)) or 1.0
     figure.update_layout(
         _layout(len(groups)),

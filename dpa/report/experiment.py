@@ -22,9 +22,10 @@ PAIRED = {
 }  # fmt: skip
 LIKELIHOOD = {"method": str, "seed": int, "file": str}
 BUDGET = {"steps": int, "rollouts": int, "start": str}
-SPLITS = ("train", "tune", "eval")
-REPORTED = {"eval": "evaluation", "tune": "tuning"}
-"""Splits that an experiment may report, in words."""
+SPLITS = {"train": "training", "tune": "tuning", "eval": "evaluation"}
+"""What the scenes of a split are called."""
+REPORTED = ("eval", "tune")
+"""Splits that an experiment may report."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +149,7 @@ class Experiment:
     @property
     def reported(self) -> str:
         """The scenes that the numbers are of, such as ``54 evaluation scenes``."""
-        return f"{self.scenes[self.split]} {REPORTED[self.split]} scenes"
+        return f"{self.scenes[self.split]} {SPLITS[self.split]} scenes"
 
     def grid(self) -> list[Decoding]:
         """Every decoding that was tried on the tuning scenes."""

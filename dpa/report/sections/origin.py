@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from dpa.report.markup import Html, Section, command, element, facts, folded
+from dpa.report.experiment import SPLITS
+from dpa.report.markup import Html, Section, command, element, facts, folded, hint
 
 
 def origin(name: str, found: Mapping[str, Any]) -> Html:
@@ -23,6 +24,19 @@ def origin(name: str, found: Mapping[str, Any]) -> Html:
     )
     config = element("pre", json.dumps(made["config"], indent=2, ensure_ascii=False, allow_nan=False))
     return folded("command and configuration", command(made["command"]), numbers, folded("configuration", config))
+
+
+def scope(found: Mapping[str, Any]) -> Html:
+    """Scenes and policies that the numbers of a study are of.
+
+    Args:
+        found: its summary.
+    """
+    made = found["made"]
+    scenes = f"{made['scenes']} {SPLITS[made['config']['split']]} scenes"
+    policies = len(made["policies"])
+    by = f"{policies} {'policy' if policies == 1 else 'policies'}"
+    return hint(f"{scenes}, {by}, {made['num_rollouts']} rollouts of each scene.")
 
 
 def study_section(

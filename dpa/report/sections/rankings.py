@@ -8,7 +8,7 @@ from typing import Any
 from dpa.report.canvas import CYCLE
 from dpa.report.charts import Difference, Line, curves, forest, gallery, heat, lines
 from dpa.report.markup import Html, Section, element, hint, interval, joined, table
-from dpa.report.sections.origin import origin
+from dpa.report.sections.origin import origin, scope
 from dpa.report.table import MINUS, MISSING, difference, number
 
 Value = Mapping[str, Any]
@@ -68,6 +68,7 @@ def validity_section(found: Mapping[str, Any]) -> Section:
             "Are the rollouts that a distance calls near to the log also the more realistic ones?",
             class_="question",
         ),
+        scope(found),
         gallery(charts),
         table(["ranking", *columns.values()], [[n, *(_cell(v[key]) for key in columns)] for n, v in rankings.items()]),
     ]
@@ -133,6 +134,7 @@ def sensitivity_section(found: Mapping[str, Any]) -> Section:
     ]
     parts = [
         element("p", "What do the options of the preference distance change?", class_="question"),
+        scope(found),
         gallery(charts),
         table(["variant", *columns.values(), "s per scene"], rows),
         hint("Means over scenes and policies with 95 % intervals; time of the processor for ranking one scene."),
@@ -174,6 +176,7 @@ def discriminator_section(found: Mapping[str, Any]) -> Section:
     held_out = [f"{name} {number(run['best']['held_out_auc'], 3)}" for name, run in found["policies"].items()]
     parts = [
         element("p", "What does a discriminator of logs and rollouts rank rollouts by?", class_="question"),
+        scope(found),
         gallery(charts),
         table(head, rows),
         hint(

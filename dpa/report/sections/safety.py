@@ -14,7 +14,7 @@ UNSEEN = {
     "wrong_way": "wrong way", "red_light": "red light", "close_pass": "close pass", "harsh_jerk": "harsh jerk",
 }  # fmt: skip
 SEEN = {"collision_rate": "collision", "offroad_rate": "off-road"}
-"""In the features of the preference distance, and in the metric."""
+"""In the paper's features of the preference distance, and in the metric."""
 RED_LIGHTS = "2025"
 """The metrics of this year weigh driving through red lights (dpa/realism/config)."""
 
@@ -31,9 +31,9 @@ def safety_tables(experiment: Experiment, comparison: Comparison, evaluations: E
     if experiment.metric.startswith(RED_LIGHTS):
         weighed = {"red_light": unseen.pop("red_light")}
     groups = (
-        ("Safety: in neither the preference distance nor the metric", unseen),
-        (f"Safety: not in the preference distance, but in the metric of {experiment.metric}", weighed),
-        ("Safety: in both the preference distance and the metric", SEEN),
+        ("Safety that neither the preference distance nor the metric sees", unseen),
+        (f"Safety that the metric of {experiment.metric} sees, and the preference distance does not", weighed),
+        ("Safety that both the preference distance and the metric see", SEEN),
     )
     shown = [(title, found) for title, keys in groups if (found := _table(experiment, comparison, evaluations, keys))]
     if not shown:

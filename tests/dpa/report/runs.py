@@ -203,7 +203,9 @@ ROLLOUTS = 16
 
 def made(recipe: str, measured: dict[str, list[dict]]) -> dict[str, Any]:
     """How a study says that it was made."""
-    return how_made(OmegaConf.create({"seed": 0, "num_rollouts": ROLLOUTS}), recipe, ["s"] * SCENES, measured)
+    return how_made(
+        OmegaConf.create({"seed": 0, "num_rollouts": ROLLOUTS, "split": "tune"}), recipe, ["s"] * SCENES, measured
+    )
 
 
 def validity() -> dict[str, Any]:

@@ -154,6 +154,8 @@ def test_methods_are_compared_with_the_headlines_in_a_column_and_a_forest(page: 
     assert cells["reference"] == cells["DPA-OMF"] == "–"
     forest = trace(figures(page, "difference in realism to DPA-OMF")[0], "own best")
     assert forest["x"] == [_rounded(entry["realism_difference"]) for entry in versus.values()]
+    low, high = figures(page, "difference in realism to DPA-OMF")[0]["layout"]["xaxis"]["range"]
+    assert low < 0 < high, "0 is in sight, though all are worse"
     assert "against DPA-OMF at top-p 0.85" in forest["hovertext"][0] and "by seed: " in forest["hovertext"][0]
     assert "Against DPA-OMF, worse: DPA-ADEF, adversarial AFD." in page.text
 
@@ -167,13 +169,13 @@ def test_safety_is_paired_scene_by_scene_where_all_have_a_value(page: Page) -> N
 def test_safety_that_the_ranking_sees_stands_apart(page: Page) -> None:
     assert [clean(cell) for cell in safety(page, "collision ↓")] == ["method", "collision ↓", "off-road ↓"]
     assert "red light ↓" in map(clean, safety(page, "wrong way ↓"))
-    assert "Safety: in neither the preference distance nor the metric" in page.text
+    assert "Safety that neither the preference distance nor the metric sees" in page.text
 
 
 def test_red_lights_stand_apart_where_the_metric_weighs_them(copied: Path, tmp_path: Path) -> None:
     change(copied, "methods", metric="2025")
     page = Page(report(copied, tmp_path / "out").read_text(encoding="utf-8"))
-    assert "Safety: not in the preference distance, but in the metric of 2025" in page.text
+    assert "Safety that the metric of 2025 sees, and the preference distance does not" in page.text
     assert [clean(cell) for cell in safety(page, "red light ↓")] == ["method", "red light ↓"]
     assert "red light ↓" not in map(clean, safety(page, "wrong way ↓"))
 
@@ -277,6 +279,7 @@ def test_the_validity_of_a_distance_is_a_figure_and_a_table(page: Page, runs: Pa
     (figure,) = figures(page, "distance over the scene's mean")
     assert trace(figure, "omf")["y"] == [_rounded(window["mean"]) for window in omf["realism"]]
     assert table(page, "ranking", "Spearman")[0][1] == told(omf["correlation"])
+    assert page.text.count("12 tuning scenes, 1 policy, 16 rollouts of each scene.") == 3
 
 
 def test_what_options_change_is_a_figure_and_a_table(page: Page, runs: Path) -> None:
