@@ -259,6 +259,9 @@ def _check_names(content: Mapping[str, Any], path: Path) -> None:
         raise ValueError(
             f"{path}: methods must hold {REFERENCE!r} and the headline {headline!r}, got {', '.join(methods)}."
         )
+    for method, label in content["labels"].items():
+        if not isinstance(label, str):
+            raise ValueError(f"{path}: labels.{method} must be str, got {label!r}; put it in quotes.")
     trained = {*content["curves"], *content["budget"], *(budget["start"] for budget in content["budget"].values())}
     for method in dict.fromkeys([*methods, *(method.partition("@")[0] for method in methods), *sorted(trained)]):
         if method not in content["labels"]:

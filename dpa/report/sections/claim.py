@@ -45,6 +45,7 @@ def _card(experiment: Experiment, title: str, entry: Mapping[str, Any] | None) -
     if entry is None:
         return Html("")
     low, high = entry["ci95"]
+    seeds = f"{entry['n_seeds']} seed{'s' if entry['n_seeds'] > 1 else ''}"
     kind = "better" if low > 0 else "worse" if high < 0 else "open"
     return element(
         "div",
@@ -54,7 +55,7 @@ def _card(experiment: Experiment, title: str, entry: Mapping[str, Any] | None) -
         element(
             "div",
             f"{experiment.labels[experiment.headline]} at {in_words(decoding_of(entry))}, reference at "
-            f"{in_words(decoding_against(entry))}; {entry['n_seeds']} seeds, {experiment.reported}",
+            f"{in_words(decoding_against(entry))}; {seeds}, {experiment.reported}",
             class_="hint",
         ),
         class_="card",
