@@ -34,6 +34,7 @@ def test_every_experiment_fits_together(name: str) -> None:
     assert set(cfg.experiment.published) <= {"reference", *cfg.methods}
     assert set((cfg.experiment.axis or {}).get("values", {})) <= set(cfg.methods)
     assert set(cfg.methods) <= set(cfg.experiment.labels)
+    assert all(isinstance(label, str) for label in cfg.experiment.labels.values()), "a number needs quotes"
 
 
 def test_a_method_comes_after_those_that_it_starts_from_or_learns_from() -> None:
