@@ -30,8 +30,9 @@ SIDES = {
 HEALTH = {
     "train/logit_std": ("Spread of the preference logits", "standard deviation of the logits"),
     "train/saturated": ("Share of saturated pairs", "share of pairs"),
-    "train/kl": ("KL to the reference", "KL per token [nats]"),
-    "train/entropy": ("Entropy of the tokens", "entropy per token [nats]"),
+    "tune/kl": ("KL to the reference", "KL per token [nats]"),
+    "tune/entropy": ("Entropy of the tokens", "entropy per token [nats]"),
+    "tune/pair_accuracy": ("Pair accuracy", "share of pairs"),
 }
 """Title and axis of the figure of a scalar."""
 POINTS = 40

@@ -187,8 +187,9 @@ def curves(folder: Path, method: str, seed: int) -> str:
         "tune/nll_demonstration": [(step, 4.0 + 0.01 * seed) for step in tuned],
         "train/logit_std": [(step, 0.01 * step) for step in trained],
         "train/saturated": [(step, 0.0) for step in trained],
-        "train/kl": [(step, 0.005 * step) for step in trained],
-        "train/entropy": [(step, 2 - 0.001 * step) for step in trained],
+        "tune/kl": [(step, 0.005 * step) for step in tuned],
+        "tune/entropy": [(step, 2 - 0.001 * step) for step in tuned],
+        "tune/pair_accuracy": [(step, 0.6 + 0.001 * step) for step in tuned],
     }  # fmt: skip
     for name, points in scalars.items():
         path = folder / run / "scalars" / f"{name}.csv"
