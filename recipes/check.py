@@ -9,7 +9,7 @@ from dpa.ranking import PreferenceDistance
 from dpa.realism.config import RealismConfig
 from dpa.tokens import VerletTokenizer
 from dpa.training.loggers import check_backend
-from recipes.cli import check_steps
+from recipes.cli import check_steps, told_of
 from recipes.losses import check_fit, make_loss
 from recipes.methods import read_setups
 from recipes.models import policy_config
@@ -69,8 +69,9 @@ def _check_rankings(cfg: DictConfig) -> None:
 def _check_methods(cfg: DictConfig) -> None:
     model = MotionLM("nano", VerletTokenizer())  # any will do: a loss is made to see its options refused
     for name, setup in read_setups(cfg).items():
-        check_fit(cfg.methods[name])
-        make_loss(cfg.methods[name].loss, model)
+        with told_of(f"methods.{name}"):
+            check_fit(cfg.methods[name])
+            make_loss(cfg.methods[name].loss, model)
         unknown = sorted(set(setup.alignment) - set(cfg.alignment))
         if unknown:
             raise ValueError(f"experiment.setup.{name}.alignment has no option {unknown[0]!r}.")

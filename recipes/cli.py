@@ -8,7 +8,8 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from inspect import Parameter, signature
 from pathlib import Path
 from typing import Any
@@ -118,6 +119,23 @@ def check_steps(section: DictConfig, name: str) -> None:
 def plain(section: DictConfig) -> dict[str, Any]:
     """A section of the configuration as plain dicts and lists, interpolations resolved."""
     return OmegaConf.to_container(section, resolve=True, throw_on_missing=True)
+
+
+@contextmanager
+def told_of(name: str) -> Iterator[None]:
+    """Errors inside the block say whom they are about.
+
+    Examples:
+        >>> with told_of("methods.ipo"):
+        ...     raise ValueError("alpha must be positive, got 0.")
+        Traceback (most recent call last):
+        ...
+        ValueError: methods.ipo: alpha must be positive, got 0.
+    """
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
 
 
 def deciding(section: DictConfig, *without: str) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from dpa.policy import Decoding
 from dpa.report.table import REFERENCE
 from envs.seeding import make_generator
 from recipes.align import align
-from recipes.cli import finished, finite, write_json
+from recipes.cli import finished, finite, told_of, write_json
 from recipes.collect import collect
 from recipes.evaluate import evaluate
 from recipes.likelihoods import PROBED, divergence, make_probes, probe
@@ -62,18 +62,19 @@ def rerank_job(cfg: DictConfig, seed: int, source: str, ranking: str) -> None:
 def align_job(cfg: DictConfig, seed: int, method: str) -> None:
     """One aligned policy."""
     runs, splits, setup = runs_of(cfg), open_splits(cfg.scenes), setup_of(cfg, method)
-    align(
-        OmegaConf.merge(cfg, {"alignment": setup.changes(cfg.alignment)}),
-        cfg.methods[method],
-        splits.train,
-        runs.policy(seed, setup.start),
-        runs.preferences(seed, "train", setup.start, setup.ranking),
-        seed,
-        runs.training(seed, method),
-        expert=None if setup.expert is None else runs.preferences(seed, "train", setup.expert),
-        watch=Watch(splits.tune, runs.preferences(seed, "tune")),
-        among=learnt_from(cfg, len(splits.train)),
-    )
+    with told_of(f"methods.{method}"):
+        align(
+            OmegaConf.merge(cfg, {"alignment": setup.changes(cfg.alignment)}),
+            cfg.methods[method],
+            splits.train,
+            runs.policy(seed, setup.start),
+            runs.preferences(seed, "train", setup.start, setup.ranking),
+            seed,
+            runs.training(seed, method),
+            expert=None if setup.expert is None else runs.preferences(seed, "train", setup.expert),
+            watch=Watch(splits.tune, runs.preferences(seed, "tune")),
+            among=learnt_from(cfg, len(splits.train)),
+        )
 
 
 def evaluate_job(cfg: DictConfig, seed: int, policy: str, split: str, top_p: float, temperature: float) -> None:
