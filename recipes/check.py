@@ -7,6 +7,7 @@ from omegaconf import DictConfig, OmegaConf
 from dpa.policy import Decoding, MotionLM
 from dpa.ranking import PreferenceDistance
 from dpa.realism.config import RealismConfig
+from dpa.report.table import REFERENCE
 from dpa.tokens import VerletTokenizer
 from dpa.training.loggers import check_backend
 from recipes.cli import check_steps, told_of
@@ -75,7 +76,7 @@ def _check_methods(cfg: DictConfig) -> None:
         unknown = sorted(set(setup.alignment) - set(cfg.alignment))
         if unknown:
             raise ValueError(f"experiment.setup.{name}.alignment has no option {unknown[0]!r}.")
-        check_steps(OmegaConf.merge(cfg.alignment, setup.changes(cfg.alignment)), f"alignment of {name}:")
+        check_steps(setup.merged(cfg.alignment), f"alignment of {name}:")
 
 
 def _check_report(cfg: DictConfig) -> None:
@@ -96,7 +97,7 @@ def _check_report(cfg: DictConfig) -> None:
             f"experiment.checkpoints={experiment.checkpoints} needs checkpoints: say for example "
             f"alignment.snapshots=[{cfg.alignment.steps // 2}]."
         )
-    further = [name for name, setup in setups.items() if setup.expert or setup.start != "reference"]
+    further = [name for name, setup in setups.items() if setup.expert or setup.start != REFERENCE]
     if experiment.checkpoints == "select" and further:
         raise ValueError(
             f"experiment.checkpoints=select chooses when all methods are trained, and {further[0]} needs another "

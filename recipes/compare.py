@@ -11,14 +11,14 @@ can. Run the same command again to go on after a kill.
 
 from __future__ import annotations
 
-import json
 import sys
 from typing import Any, NamedTuple
 
 import hydra
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from dpa.policy import Decoding
+from dpa.report.experiment import read_json
 from dpa.report.table import REFERENCE, print_table
 from recipes.check import check_experiment
 from recipes.cli import CONFIG, recipe, write_json
@@ -144,7 +144,7 @@ def shown_policies(cfg: DictConfig) -> list[str]:
 
 def snapshots_of(cfg: DictConfig, method: str) -> list[str]:
     """Names of the snapshots of a method."""
-    options = OmegaConf.merge(cfg.alignment, setup_of(cfg, method).changes(cfg.alignment))
+    options = setup_of(cfg, method).merged(cfg.alignment)
     return [f"{method}{SNAPSHOT}{step}" for step in options.snapshots if step < options.steps]
 
 
@@ -161,7 +161,7 @@ def spec(decoding: Decoding) -> tuple[float, float]:
 def tuning_realism(cfg: DictConfig, policy: str, decoding: Decoding) -> float:
     """Sum over seeds of the mean realism on the tuning scenes."""
     paths = [runs_of(cfg).evaluation(seed, policy, "tune", decoding) for seed in cfg.seeds]
-    return sum(json.loads(path.read_text(encoding="utf-8"))["mean"]["realism"] for path in paths)
+    return sum(read_json(path)["mean"]["realism"] for path in paths)
 
 
 @hydra.main(**CONFIG, config_name="compare")

@@ -22,14 +22,12 @@ from rich.table import Table
 from torch import Tensor
 
 from dpa.discriminator import Discriminator, mean_squared_jerk
-from dpa.policy import ContextOptions, Decoding
+from dpa.policy import ContextOptions
 from dpa.ranking import Distance, occupancy_features
 from dpa.realism import realism_of_groups
 from dpa.report.studies import plot_discriminator
-from dpa.rollout import make_collector
 from dpa.tokens import MotionTokenizer
 from dpa.training.checkpoint import load_policy, load_weights, save_policy
-from envs.progress import progress
 from envs.seeding import make_generator
 from envs.store import SceneStore
 from recipes.adversary import best_look, fit
@@ -37,10 +35,10 @@ from recipes.cli import CONFIG, build, finished, finite, plain, recipe, write_js
 from recipes.models import open_policy, weights_digest
 from recipes.motions import MotionShelf, Sight, driven_log
 from recipes.rankings import build_distance
-from recipes.rolled import Rolled, rolled
+from recipes.rolled import Rolled
 from recipes.scenes import fingerprint, open_splits
 from recipes.spurious import QUANTITIES, RANKINGS, summarise
-from recipes.study import as_json, how_made, policies_of, shown, study_policy
+from recipes.study import as_json, how_made, policies_of, rolled_out, shown, study_policy
 
 FIGURES = ("realism", "kinematic", "interactive", "map_based")
 RANDOM_GROUPS = 8
@@ -80,22 +78,9 @@ def trained(cfg: DictConfig, scenes: SceneStore, policy: Path, name: str) -> tup
         return net.eval(), done
     shelf = MotionShelf(folder / "motions", decided_by)
     there = frozenset(shelf.scenes())
-    batches = make_collector(
-        scenes,
-        model,
-        num_rollouts=cfg.training.num_rollouts,
-        done=there,
-        decoding=build(Decoding, cfg.decoding, "decoding"),
-        options=context,
-        seed=cfg.seed,
-        memory=cfg.memory,
-        device=cfg.device,
-    )
     see = partial(seen, sight=sight, tokenizer=copy.deepcopy(model.tokenizer).cpu(), options=context)
-    with progress(total=len(scenes), description=f"{name} rollouts", initial=len(there), unit="scene") as bar:
-        for each in rolled(batches, scenes, cfg.training.num_rollouts, there):
-            shelf.put(each.index, see(each)[0])
-            bar.update()
+    for each in rolled_out(cfg, scenes, model, context, cfg.training.num_rollouts, there, f"{name} rollouts"):
+        shelf.put(each.index, see(each)[0])
     net, curve = fit(cfg.training, shape, shelf, folder, seed=cfg.seed, decided_by=decided_by, logger=cfg.logger)
     save_policy(weights, net.state_dict(), shape, {"seed": cfg.seed})
     done = {"options": decided_by, "scenes": len(scenes), "best": best_look(curve), "curve": curve}

@@ -144,7 +144,7 @@ def summarise(scored: list[dict[str, Any]], scene_ids: list[str]) -> dict[str, A
     figures = [result.as_dict() | entry for result, entry in zip(results, scored, strict=True)]
     per_scene = {name: [finite(figure[name]) for figure in figures] for name in SCENE_FIGURES}
     return {
-        "mean": {name: _mean(values) for name, values in per_scene.items()},
+        "mean": {name: mean_known(values) for name, values in per_scene.items()},
         "likelihood": {name: finite(value) for name, value in mean_result(results).likelihood.items()},
         "scenes": scene_ids,
         "per_scene": per_scene,
@@ -184,7 +184,8 @@ def final_spread(scene: Any, trajectories: torch.Tensor, controlled: torch.Tenso
     return (last - last.mean(0)).square().sum(-1).mean(0).sqrt().mean().item()
 
 
-def _mean(values: list[float | None]) -> float | None:
+def mean_known(values: list[float | None]) -> float | None:
+    """Mean of the values that are known; None where none is."""
     known = [value for value in values if value is not None]
     return sum(known) / len(known) if known else None
 

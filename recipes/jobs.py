@@ -5,7 +5,6 @@ A job may give the seconds that it spent for another stage of the account.
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import torch
@@ -17,7 +16,7 @@ from envs.seeding import make_generator
 from recipes.align import align
 from recipes.cli import finished, finite, told_of, write_json
 from recipes.collect import collect
-from recipes.evaluate import evaluate
+from recipes.evaluate import evaluate, mean_known
 from recipes.likelihoods import PROBED, divergence, make_probes, probe
 from recipes.methods import setup_of
 from recipes.models import open_policy, weights_digest
@@ -64,7 +63,7 @@ def align_job(cfg: DictConfig, seed: int, method: str) -> None:
     runs, splits, setup = runs_of(cfg), open_splits(cfg.scenes), setup_of(cfg, method)
     with told_of(f"methods.{method}"):
         align(
-            OmegaConf.merge(cfg, {"alignment": setup.changes(cfg.alignment)}),
+            OmegaConf.merge(cfg, {"alignment": setup.merged(cfg.alignment)}),
             cfg.methods[method],
             splits.train,
             runs.policy(seed, setup.start),
@@ -111,13 +110,8 @@ def likelihood_job(cfg: DictConfig, seed: int, policy: str, split: str) -> None:
     found = probe(model.to(cfg.device), probes, cfg.device)
     drift = divergence(model, reference, scenes, options, num_rollouts=cfg.drift_rollouts, seed=seed, device=cfg.device)
     per_scene = {name: [finite(each[name]) for each in found] for name in PROBED} | {"kl": list(map(finite, drift))}
-    mean = {name: _mean(values) for name, values in per_scene.items()}
+    mean = {name: mean_known(values) for name, values in per_scene.items()}
     write_json(path, {"options": decided_by, "mean": mean, "scenes": scenes.scene_ids, "per_scene": per_scene})
-
-
-def _mean(values: list[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return math.fsum(known) / len(known) if known else None
 
 
 def runs_of(cfg: DictConfig) -> RunFolder:

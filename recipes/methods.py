@@ -32,10 +32,10 @@ class Setup:
     alignment: Mapping[str, Any] = field(default_factory=dict)
     length: float = 1.0
 
-    def changes(self, section: DictConfig) -> dict[str, Any]:
-        """What this method changes of the section ``alignment``."""
-        changed = dict(self.alignment)
-        return changed | {"steps": round(self.length * changed.get("steps", section.steps))}
+    def merged(self, section: DictConfig) -> DictConfig:
+        """The section ``alignment`` of this method."""
+        options = OmegaConf.merge(section, self.alignment)
+        return OmegaConf.merge(options, {"steps": round(self.length * options.steps)})
 
 
 def setup_of(cfg: DictConfig, method: str) -> Setup:

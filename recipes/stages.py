@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import fcntl
-import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from dpa.report.experiment import read_json
 from recipes.cli import write_json
 from recipes.pool import Job, Workers
 
@@ -64,7 +64,7 @@ class Stages:
 
 def read_account(path: Path) -> dict[str, dict[str, float]]:
     """``{stage: {job: seconds}}``, empty where nothing has run yet."""
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    return read_json(path) if path.is_file() else {}
 
 
 @contextmanager

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig
 
-from dpa.policy import Decoding
+from dpa.policy import ContextOptions, Decoding, MotionLM
 from dpa.ranking import Distance
 from dpa.report.statistics import Interval, summary
 from dpa.rollout import make_collector
@@ -77,27 +77,51 @@ def study_policy(
         return done["per_scene"]
     partial = PartialResult(path, options)
     found = partial.read()
-    batches = make_collector(
-        scenes,
-        model,
-        num_rollouts=cfg.num_rollouts,
-        done=found,
-        decoding=build(Decoding, cfg.decoding, "decoding"),
-        options=context,
-        seed=cfg.seed,
-        memory=cfg.memory,
-        device=cfg.device,
-    )
-    with progress(total=len(scenes), description=name, initial=len(found), unit="scene") as bar:
-        for each in rolled(batches, scenes, cfg.num_rollouts, frozenset(found)):
-            numbers = measure(each)
-            partial.add({each.index: numbers})
-            found[each.index] = numbers
-            bar.update()
+    for each in rolled_out(cfg, scenes, model, context, cfg.num_rollouts, frozenset(found), name):
+        numbers = measure(each)
+        partial.add({each.index: numbers})
+        found[each.index] = numbers
     per_scene = [found[index] for index in range(len(scenes))]
     write_json(path, {"options": options, "scenes": scenes.scene_ids, "per_scene": per_scene})
     partial.remove()
     return per_scene
+
+
+def rolled_out(
+    cfg: DictConfig,
+    scenes: SceneStore,
+    model: MotionLM,
+    options: ContextOptions,
+    num_rollouts: int,
+    done: frozenset[int],
+    name: str,
+) -> Iterator[Rolled]:
+    """Roll the scenes out that are not done, under a progress bar.
+
+    Args:
+        cfg: with ``decoding``, ``seed``, ``memory`` and ``device``.
+        scenes: to roll out.
+        model: that drives.
+        options: how it cuts scenes up.
+        num_rollouts: of each scene.
+        done: indices of the scenes to leave out.
+        name: of the bar.
+    """
+    batches = make_collector(
+        scenes,
+        model,
+        num_rollouts=num_rollouts,
+        done=done,
+        decoding=build(Decoding, cfg.decoding, "decoding"),
+        options=options,
+        seed=cfg.seed,
+        memory=cfg.memory,
+        device=cfg.device,
+    )
+    with progress(total=len(scenes), description=name, initial=len(done), unit="scene") as bar:
+        for each in rolled(batches, scenes, num_rollouts, done):
+            yield each
+            bar.update()
 
 
 def distances_of(section: DictConfig, name: str) -> dict[str, Distance]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from dpa.policy import Decoding
+from dpa.report.experiment import read_json
 from dpa.report.statistics import compare_methods
 from dpa.report.table import REFERENCE
 from recipes.candidates import SIDES
@@ -42,7 +41,7 @@ class Results:
     def row(self, method: str, decoding: Decoding, seed: int, split: str) -> dict[str, Any]:
         """Means of one run, and the file with the values of every scene."""
         path = self.runs.evaluation(seed, self.policies[method], split, decoding)
-        found = _read(path)
+        found = read_json(path)
         return {
             "method": method,
             "seed": seed,
@@ -60,7 +59,7 @@ class Results:
     def likelihood(self, method: str, seed: int) -> dict[str, Any]:
         """What a policy thinks of logs and rollouts of the reported scenes."""
         path = self.runs.likelihood(seed, self.policies[method], self.split)
-        mean = _read(path)["mean"]
+        mean = read_json(path)["mean"]
         return {
             "method": method,
             "seed": seed,
@@ -100,7 +99,9 @@ class Results:
         return [score for score, known in zip(scores, self.known, strict=True) if known]
 
     def _scores(self, method: str, decoding: Decoding, seed: int) -> list[float | None]:
-        return _read(self.runs.evaluation(seed, self.policies[method], self.split, decoding))["per_scene"]["realism"]
+        return read_json(self.runs.evaluation(seed, self.policies[method], self.split, decoding))["per_scene"][
+            "realism"
+        ]
 
 
 def summarise_experiment(
@@ -179,7 +180,7 @@ def budget(cfg: DictConfig, method: str) -> dict[str, Any]:
         ``steps``, ``rollouts`` (read in these steps) and ``start``.
     """
     setup, data = setup_of(cfg, method), cfg.methods[method].data
-    options = OmegaConf.merge(cfg.alignment, setup.changes(cfg.alignment))
+    options = setup.merged(cfg.alignment)
     sides = 1 if SIDES[data.kind] == "targets" else 2
     before = {"steps": 0, "rollouts": 0} if setup.start == REFERENCE else budget(cfg, setup.start)
     return {
@@ -187,10 +188,6 @@ def budget(cfg: DictConfig, method: str) -> dict[str, Any]:
         "rollouts": before["rollouts"] + options.steps * options.scenes_per_step * options.pairs_per_scene * sides,
         "start": setup.start,
     }
-
-
-def _read(path: Path) -> dict[str, Any]:
-    return json.loads(path.read_text(encoding="utf-8"))
 
 
 def labels(cfg: DictConfig, policies: Mapping[str, str]) -> dict[str, str]:

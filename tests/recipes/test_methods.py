@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from recipes.check import check_experiment
 from recipes.cli import CONFIG
@@ -88,7 +88,7 @@ def test_one_name_is_one_training_in_all_experiments() -> None:
     for name in (name for name in EXPERIMENTS if name != "base"):
         cfg = configuration(f"experiment={name}")
         for method, setup in read_setups(cfg).items():
-            alignment = OmegaConf.merge(cfg.alignment, setup.changes(cfg.alignment))
+            alignment = setup.merged(cfg.alignment)
             data, loss = cfg.methods[method].data, cfg.methods[method].loss
             training = str((data, loss, alignment, setup.start, setup.expert, cfg.rankings.get(setup.ranking or "")))
             assert meaning.setdefault(method, (name, training))[1] == training, (method, name, meaning[method][0])
