@@ -107,7 +107,7 @@ def likelihood_job(cfg: DictConfig, seed: int, policy: str, split: str) -> None:
         raise ValueError(
             f"{store.folder} holds {len(probes)} of {len(scenes)} scenes; run the same command again to fill it."
         )
-    found = probe(model.to(cfg.device), probes, cfg.device)
+    found = probe(model.to(cfg.device), reference.to(cfg.device), probes, cfg.device)
     drift = divergence(model, reference, scenes, options, num_rollouts=cfg.drift_rollouts, seed=seed, device=cfg.device)
     per_scene = {name: [finite(each[name]) for each in found] for name in PROBED} | {"kl": list(map(finite, drift))}
     mean = {name: mean_known(values) for name, values in per_scene.items()}

@@ -19,7 +19,9 @@ from dpa.training.batches import log_item
 from envs import keys
 from envs.scene import SceneSource
 
-PROBED = ("pair_accuracy", "nll_demonstration", "nll_preferred", "nll_unpreferred", "entropy")
+PROBED = (
+    "pair_accuracy", "reward_accuracy", "nll_demonstration", "nll_preferred", "nll_unpreferred", "entropy"
+)  # fmt: skip
 """What :func:`probe` measures of every scene."""
 
 
@@ -82,43 +84,43 @@ def make_probes(
 
 
 @torch.no_grad()
-def probe(
-    model: MotionLM, probes: Iterable[Probe], device: str = "cpu", reference: MotionLM | None = None
-) -> list[dict[str, float]]:
+def probe(model: MotionLM, reference: MotionLM, probes: Iterable[Probe], device: str = "cpu") -> list[dict[str, float]]:
     """Ask a policy about each probe.
 
     Args:
         model: in whatever mode it is; dropout would count.
+        reference: what the policy started from.
         probes: of some scenes.
         device: of the models.
-        reference: what the policy started from, for ``kl``.
 
     Returns:
-        For each probe ``pair_accuracy`` (share of pairs whose preferred rollout is the more likely one), the negative
-        log-likelihood per token [nats] of the demonstration, of the preferred and of the unpreferred rollouts, and
-        along the rollouts the ``entropy`` per token and, with a reference, ``kl`` from it per token [nats]. NaN where
-        there is no token.
+        For each probe ``pair_accuracy`` (share of pairs whose preferred rollout is the more likely one),
+        ``reward_accuracy`` (share of those whose preferred rollout gained more over the reference, ties count half: a
+        policy that has learnt nothing has 0.5), the negative log-likelihood per token [nats] of the demonstration, of
+        the preferred and of the unpreferred rollouts, and along the rollouts the ``entropy`` and the ``kl`` from the
+        reference per token [nats]. NaN where there is no token.
     """
-    return [_probed(model, each, device, reference) for each in probes]
+    return [_probed(model, reference, each, device) for each in probes]
 
 
-def _probed(model: MotionLM, each: Probe, device: str, reference: MotionLM | None) -> dict[str, float]:
+def _probed(model: MotionLM, reference: MotionLM, each: Probe, device: str) -> dict[str, float]:
     context = collate_contexts([each.context]).to(device)
     tokens = torch.cat((each.preferred, each.unpreferred))[None].to(device)
     valid = each.valid[None, None].to(device)
-    logits = model(context, tokens, valid)
-    near, far = (token_log_prob(logits, tokens)[0] * valid[0]).sum((-1, -2)).chunk(2)
+    logits, before = (policy(context, tokens, valid) for policy in (model, reference))
+    now, then = ((token_log_prob(seen, tokens)[0] * valid[0]).sum((-1, -2)) for seen in (logits, before))
+    (near, far), (near_gain, far_gain) = now.chunk(2), (now - then).chunk(2)
     log_tokens, log_valid = (value[None, None].to(device) for value in (each.demonstration, each.demonstration_valid))
     log = token_log_prob(model(context, log_tokens, log_valid), log_tokens)
     found = {
         "pair_accuracy": (near > far).double().mean(),
+        "reward_accuracy": ((near_gain > far_gain).double() + (near_gain == far_gain).double() / 2).mean(),
         "nll_demonstration": -log[log_valid].mean(),
         "nll_preferred": -near.mean() / valid.sum(),
         "nll_unpreferred": -far.mean() / valid.sum(),
         "entropy": _mean(token_entropy(logits), valid),
+        "kl": _mean(token_divergence(logits, before), valid),
     }
-    if reference is not None:
-        found["kl"] = _mean(token_divergence(logits, reference(context, tokens, valid)), valid)
     return {name: value.item() for name, value in found.items()}
 
 

@@ -52,6 +52,6 @@ class Look:
         """Means over the scenes, as curves are named."""
         training = self.model.training
         self.model.eval()
-        found = probe(self.model, self.probes, device, self.reference)
+        found = probe(self.model, self.reference, self.probes, device)
         self.model.train(training)
         return {f"tune/{name}": nanmean([each[name] for each in found]) for name in (*PROBED, "kl")}

@@ -39,9 +39,12 @@ def test_a_policy_is_asked_for_the_likelihood_of_logs_and_of_both_sides() -> Non
         unpreferred=torch.tensor([[[1, 1, 1], [1, 0, 0]], [[1, 1, 1], [1, 0, 0]]]),
         valid=valid,
     )
-    found = probe(Steady(probabilities), [asked])[0]
+    reference = [0.25, 0.5, 0.125, 0.125]
+    found = probe(Steady(probabilities), Steady(reference), [asked])[0]
     nats = [-math.log(p) for p in probabilities]
     assert found["pair_accuracy"] == 0.5  # 0s are likelier than 1s, and 2s are not
+    assert found["reward_accuracy"] == 1  # since the reference 0s gained and 1s lost; 2s are as they were
+    assert found["kl"] == pytest.approx(sum(p * math.log(p / q) for p, q in zip(probabilities, reference, strict=True)))
     assert found["nll_demonstration"] == pytest.approx((nats[0] + nats[1] + nats[2]) / 3)
     assert found["nll_preferred"] == pytest.approx((4 * nats[0] + 4 * nats[2]) / 8)
     assert found["nll_unpreferred"] == pytest.approx(nats[1])
@@ -51,8 +54,10 @@ def test_a_policy_is_asked_for_the_likelihood_of_logs_and_of_both_sides() -> Non
 def test_a_log_without_tokens_has_no_likelihood() -> None:
     tokens, nothing = torch.zeros(1, 1, 2, dtype=torch.int64), torch.zeros(1, 2, dtype=torch.bool)
     asked = Probe(make_context(straight_road(1)), tokens[0], nothing, tokens, tokens + 1, ~nothing)
-    found = probe(Steady([0.4, 0.3, 0.2, 0.1]), [asked])[0]
+    policy = Steady([0.4, 0.3, 0.2, 0.1])
+    found = probe(policy, policy, [asked])[0]
     assert math.isnan(found["nll_demonstration"]) and found["pair_accuracy"] == 1
+    assert found["reward_accuracy"] == 0.5 and found["kl"] == 0, "what has learnt nothing gains nothing"
 
 
 @pytest.fixture(scope="module")

@@ -498,7 +498,15 @@ def test_scenes_that_no_loss_sees_are_looked_at_along_the_way(
         assert run("align", *command).status == 130
     outcome = run("align", *command)
     assert outcome.status == 0, outcome.err
-    for name in ("nll_preferred", "nll_unpreferred", "nll_demonstration", "pair_accuracy", "entropy", "kl"):
+    for name in (
+        "nll_preferred",
+        "nll_unpreferred",
+        "nll_demonstration",
+        "pair_accuracy",
+        "reward_accuracy",
+        "entropy",
+        "kl",
+    ):
         curve = read_curve(tmp_path / "omf", f"tune/{name}")
         assert [step for step, _ in curve] == [0, 2, 4], "each step once, also after a kill"
     drift = [value for _, value in read_curve(tmp_path / "omf", "tune/kl")]

@@ -18,10 +18,11 @@ from dpa.report.study import Evaluations
 from dpa.report.table import MINUS, REFERENCE, number
 
 FIGURES = {
-    "pair_accuracy": "pair accuracy ↑", "nll_preferred": "NLL preferred", "nll_unpreferred": "NLL unpreferred",
+    "pair_accuracy": "pair accuracy ↑", "reward_accuracy": "reward accuracy ↑",
+    "nll_preferred": "NLL preferred", "nll_unpreferred": "NLL unpreferred",
     "nll_demonstration": "NLL log", "entropy": "entropy", "kl": "KL to reference",
 }  # fmt: skip
-DIGITS = {"pair_accuracy": 3}
+DIGITS = {"pair_accuracy": 3, "reward_accuracy": 3}
 SIDES = {
     "tune/nll_preferred": ("preferred", "#2a78b5"),
     "tune/nll_unpreferred": ("unpreferred", "#d55e00"),
@@ -33,6 +34,7 @@ HEALTH = {
     "tune/kl": ("KL to the reference", "KL per token [nats]"),
     "tune/entropy": ("Entropy of the tokens", "entropy per token [nats]"),
     "tune/pair_accuracy": ("Pair accuracy", "share of pairs"),
+    "tune/reward_accuracy": ("Reward accuracy", "share of pairs"),
 }
 """Title and axis of the figure of a scalar."""
 POINTS = 40
@@ -71,7 +73,8 @@ def likelihood_table(experiment: Experiment, evaluations: Evaluations) -> Html:
         hint(
             f"On the reference's ranked rollouts of the {experiment.reported}, means over seeds; in small type the "
             "difference from the reference with its 95 % interval. Pair accuracy: how often the nearer rollout of a "
-            "pair is the likelier one. NLL: negative log-likelihood per token [nats]."
+            "pair is the likelier one; reward accuracy: how often it gained more "
+            "likelihood over the reference (chance: 0.5). NLL: negative log-likelihood per token [nats]."
         ),
     ]
     return joined(parts)
