@@ -1,6 +1,7 @@
 """The jobs of a study, each a function of the configuration and of what names it, so that any worker can run it.
 
-A job may give the seconds that it spent for another stage of the account.
+A job may give the seconds that it spent for the account: on another stage, or on its own where it knows better than the
+clock, which does not see what a killed process had done.
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from dpa.policy import Decoding
+from dpa.report.curves import read_curves
 from dpa.report.table import REFERENCE
+from dpa.training.run import SECONDS
 from envs.seeding import make_generator
 from recipes.align import align
 from recipes.cli import finished, finite, told_of, write_json
@@ -28,9 +31,11 @@ from recipes.scenes import fingerprint, open_splits
 from recipes.watch import Watch
 
 
-def pretrain_job(cfg: DictConfig, seed: int) -> None:
+def pretrain_job(cfg: DictConfig, seed: int) -> dict[str, float]:
     """Reference of one seed."""
-    pretrain(cfg, open_splits(cfg.scenes), seed, runs_of(cfg).training(seed, REFERENCE))
+    folder = runs_of(cfg).training(seed, REFERENCE)
+    pretrain(cfg, open_splits(cfg.scenes), seed, folder)
+    return {"pretrain": seconds_trained(folder)}
 
 
 def collect_job(cfg: DictConfig, seed: int, split: str, source: str) -> dict[str, float]:
@@ -58,9 +63,10 @@ def rerank_job(cfg: DictConfig, seed: int, source: str, ranking: str) -> None:
     rerank(section, scenes, runs.policy(seed, source), given, made)
 
 
-def align_job(cfg: DictConfig, seed: int, method: str) -> None:
+def align_job(cfg: DictConfig, seed: int, method: str) -> dict[str, float]:
     """One aligned policy."""
     runs, splits, setup = runs_of(cfg), open_splits(cfg.scenes), setup_of(cfg, method)
+    folder = runs.training(seed, method)
     with told_of(f"methods.{method}"):
         align(
             OmegaConf.merge(cfg, {"alignment": setup.merged(cfg.alignment)}),
@@ -69,11 +75,18 @@ def align_job(cfg: DictConfig, seed: int, method: str) -> None:
             runs.policy(seed, setup.start),
             runs.preferences(seed, "train", setup.start, setup.ranking),
             seed,
-            runs.training(seed, method),
+            folder,
             expert=None if setup.expert is None else runs.preferences(seed, "train", setup.expert),
             watch=Watch(splits.tune, runs.preferences(seed, "tune")),
             among=learnt_from(cfg, len(splits.train)),
         )
+    return {"align": seconds_trained(folder)}
+
+
+def seconds_trained(folder: Path) -> float:
+    """What the steps of a training run took [s], whichever processes made them."""
+    curve = read_curves(folder)[SECONDS]
+    return curve["value"][-1] * curve["step"][-1]
 
 
 def evaluate_job(cfg: DictConfig, seed: int, policy: str, split: str, top_p: float, temperature: float) -> None:

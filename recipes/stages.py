@@ -17,7 +17,8 @@ class Stages:
     """Runs stages and keeps how long each job took when it was done for the first time.
 
     Several experiments share an account, as they share what the jobs make: reading a result back costs nothing in it.
-    Seconds are those of one worker. What a kill cut short is not in the account, only what was left to do afterwards.
+    Seconds are those of one worker. Of training they count all steps; of other jobs that a kill cut short only what was
+    left to do afterwards.
 
     Args:
         workers: that run the jobs.
@@ -36,7 +37,8 @@ class Stages:
 
         Args:
             name: of the stage.
-            job: of a module, so that a worker can import it. It may give seconds that it spent for other stages.
+            job: of a module, so that a worker can import it. It may give seconds that it spent, by stage; the
+                clock tells the rest.
             config: its first argument, the same for all jobs.
             arguments: the others; they name the job.
         """
@@ -44,10 +46,9 @@ class Stages:
             return
         jobs = [Job(job, (config, *each), " ".join(map(str, (name, *each)))) for each in arguments]
         for done, seconds, others in self.workers.run(jobs, name):
-            spent = others or {}
-            self._book(name, done, seconds - sum(spent.values()))
-            for other, part in spent.items():
-                self._book(other, done, part)
+            spent = {name: seconds - sum((others or {}).values())} | (others or {})
+            for stage, part in spent.items():
+                self._book(stage, done, part)
 
     def _book(self, stage: str, job: str, seconds: float) -> None:
         self._asked.setdefault(stage, set()).add(job)

@@ -14,6 +14,9 @@ from dpa.training.loggers import Backend, make_logger
 from envs.options import differences
 from envs.progress import progress
 
+SECONDS = "time/seconds_per_step"
+"""Curve of what a step takes [s], the mean from the first one on."""
+
 
 def _refuse_other_options(folder: Path, config: Mapping[str, Any]) -> None:
     """A run that was killed before its first checkpoint is a run too: its folder is not for other options."""
@@ -80,20 +83,24 @@ class Run:
         self.description, self.ranks = description, ranks
         self.state: dict[str, Any] = {}
         """Plain values that are kept in every checkpoint, for the recipe's own use."""
+        self._spent = 0.0
         self._checkpoints = Checkpointer(self.folder / "checkpoints", config=config)
         _refuse_other_options(self.folder, config)
         saved = self._checkpoints.latest()
         if saved is not None:
             restore(saved, parts)
-            self.state = dict(saved["progress"])
+            self.state, self._spent = dict(saved["progress"]["recipe"]), saved["progress"]["seconds"]
         step = None if saved is None else saved["step"]
         self.first_step = ranks.agree(step or 0, "a checkpoint of step", self.folder)
         self._logger = make_logger(backend, self.folder, config, resume_step=step, mode=mode) if ranks.main else None
         self._step = self.first_step
 
     def steps(self) -> Iterator[int]:
-        """Steps that are left, counted from 0; saves a checkpoint after every interval and after the last one."""
-        start = time.perf_counter()
+        """Steps that are left, counted from 0; saves a checkpoint after every interval and after the last one.
+
+        :data:`SECONDS` counts what earlier processes took for the steps that this one goes on from.
+        """
+        start = time.perf_counter() - self._spent
         with progress(
             total=self.total_steps,
             description=self.description,
@@ -107,9 +114,11 @@ class Run:
                 bar.update()
                 done = step + 1
                 if done % self.checkpoint_interval == 0 or done == self.total_steps:
-                    self.log({"time/seconds_per_step": (time.perf_counter() - start) / (done - self.first_step)})
+                    seconds = time.perf_counter() - start
+                    self.log({SECONDS: seconds / done})
                     if self.ranks.main:
-                        self._checkpoints.save(done, capture(self.parts, progress=self.state))
+                        progressed = {"recipe": self.state, "seconds": seconds}
+                        self._checkpoints.save(done, capture(self.parts, progress=progressed))
 
     def log(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
         """Write numbers, as ``"<group>/<name>"``, on the main rank only.

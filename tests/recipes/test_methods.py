@@ -130,6 +130,17 @@ def test_seconds_that_a_job_spent_for_another_stage_are_booked_there(tmp_path: P
     assert stages.seconds["rank"] == 0.02 and 0.01 <= stages.seconds["collect"] < 0.03
 
 
+def test_a_job_that_knows_what_it_took_is_believed(tmp_path: Path) -> None:
+    with Workers(1, threads=1) as workers:
+        stages = Stages(workers, tmp_path / "stages.json")
+        stages.run("align", _trained_before, 7.0, [()])
+    assert stages.seconds == {"align": 7.0}
+
+
+def _trained_before(seconds: float) -> dict[str, float]:
+    return {"align": seconds}
+
+
 def _sleep_and_rank(factor: float, seconds: float) -> dict[str, float]:
     time.sleep(factor * seconds)
     return {"rank": 0.02}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import pytest
@@ -92,6 +93,15 @@ def test_the_last_step_is_saved_whatever_the_interval(tmp_path: Path) -> None:
 def test_speed_is_logged_with_every_checkpoint(tmp_path: Path) -> None:
     train(tmp_path)
     assert [step for step, _ in read_curve(tmp_path, "time/seconds_per_step")] == [2, 4, 6, 8, 10]
+
+
+def test_the_time_of_a_step_counts_what_was_done_before_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dpa.training.run.time.perf_counter", itertools.count(0, 10).__next__)
+    with pytest.raises(Interrupted):
+        train(tmp_path, stop_at=5)
+    train(tmp_path)
+    # The clock is looked at once at the start and once with every second step: ten seconds for two steps.
+    assert [value for _, value in read_curve(tmp_path, "time/seconds_per_step")] == [5, 5, 5, 5, 5]
 
 
 def test_a_run_with_other_options_does_not_go_on_in_the_same_folder(tmp_path: Path) -> None:
