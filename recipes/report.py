@@ -3,7 +3,8 @@
     python -m recipes.report RUNS OUT
 
 RUNS is the folder that recipes.compare fills (its output). OUT is the page: a .html file, or a folder for index.html.
-With a .png it is one picture, the differences of the first experiment. The numbers are those of the files in RUNS.
+With a .png it is one picture, the differences of the first experiment; with a .md the tables of all experiments, for a
+document. The numbers are those of the files in RUNS.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ import sys
 from pathlib import Path
 
 from dpa.report.figures import plot_comparison
-from dpa.report.page import write_study
+from dpa.report.page import write_study, write_whole
 from dpa.report.study import read_study
+from dpa.report.text import study_text
 from recipes.cli import refused
 
 EXPERIMENTS = Path(__file__).parent / "config" / "experiment"
@@ -22,11 +24,11 @@ EXPERIMENTS = Path(__file__).parent / "config" / "experiment"
 
 
 def report(runs: Path, out: Path) -> Path:
-    """Write the page of a study, or the picture of its first experiment.
+    """Write the page of a study, the picture of its first experiment, or its tables.
 
     Args:
         runs: folder of results.
-        out: ``.html``, a folder for ``index.html``, or ``.png``.
+        out: ``.html``, a folder for ``index.html``, ``.png``, or ``.md``.
 
     Returns:
         The file that was written.
@@ -35,11 +37,13 @@ def report(runs: Path, out: Path) -> Path:
         ValueError: no results in ``runs``, or a file of it that cannot be read; the message names it.
     """
     study = read_study(runs)
+    if out.suffix in (".png", ".md") and not study.experiments:
+        raise ValueError(f"{runs} holds no experiments/*.json, and {out.name} would show nothing else; say page.html.")
     if out.suffix == ".png":
-        if not study.experiments:
-            raise ValueError(f"{runs} holds no experiments/*.json, and {out.name} is a picture of one; say page.html.")
         plot_comparison(next(iter(study.experiments.values())), out)
         return out
+    if out.suffix == ".md":
+        return write_whole(out, study_text(study))
     page = out if out.suffix == ".html" else out / "index.html"
     return write_study(page, study, experiments=known_experiments())
 
@@ -55,7 +59,7 @@ def make_parser() -> argparse.ArgumentParser:
         prog="python -m recipes.report", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("runs", metavar="RUNS", type=Path, help="folder of results")
-    parser.add_argument("out", metavar="OUT", type=Path, help="page.html, a folder, or picture.png")
+    parser.add_argument("out", metavar="OUT", type=Path, help="page.html, a folder, picture.png, or tables.md")
     return parser
 
 

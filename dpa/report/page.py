@@ -119,8 +119,21 @@ def _some(section: Section | None) -> list[Section]:
 
 
 def _write(path: Path, title: str, body: str, *, style: str = "") -> Path:
+    return write_whole(path, filled("page.html", {"title": escape(title), "style": style, "body": body}))
+
+
+def write_whole(path: Path, text: str) -> Path:
+    """Write a text; it appears whole or not at all.
+
+    Args:
+        path: of the file, in a folder that is made where there is none.
+        text: its content.
+
+    Returns:
+        ``path``.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.name}.part")
-    part.write_text(filled("page.html", {"title": escape(title), "style": style, "body": body}), encoding="utf-8")
+    part.write_text(text, encoding="utf-8")
     os.replace(part, path)
     return path

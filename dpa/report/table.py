@@ -204,17 +204,17 @@ def print_table(
     console.print(Segments(console.render(table, options)), crop=False, soft_wrap=True, end="")
 
 
-def to_markdown(rows: Sequence[dict[str, Any]], paired: Sequence[dict[str, Any]] = ()) -> str:
-    """The table in GitHub's Markdown; the arguments are those of :func:`summarise`.
+def to_markdown(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in GitHub's Markdown; what is in no first column is set to the right.
 
     Examples:
-        >>> print(to_markdown([{"method": "reference", "realism": 0.7}]).splitlines()[2][:36])
-        | reference | 1 | – | – | – | 0.700
+        >>> print(to_markdown(["method", "realism"], [["reference", "0.700"]]))
+        | method | realism |
+        | --- | ---: |
+        | reference | 0.700 |
     """
-    records = summarise(rows, paired)
-    titles = header(records)
-    lines = [titles, ["---" if title == "method" else "---:" for title in titles], *cells(records)]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines) + "\n"
+    lines = [titles, ["---", *["---:"] * (len(titles) - 1)], *rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
 
 
 def _decoding(records: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:

@@ -383,8 +383,9 @@ def test_a_study_of_rankings_alone_makes_a_page_without_a_claim(copied: Path, tm
     shutil.rmtree(copied / "experiments")
     page = Page(report(copied, tmp_path / "out").read_text(encoding="utf-8"))
     assert "No claim: the study has no experiment that compares methods." in page.text
-    with pytest.raises(ValueError, match=r"holds no experiments/\*\.json, and p\.png is a picture of one"):
-        report(copied, tmp_path / "p.png")
+    for name in ("p.png", "t.md"):
+        with pytest.raises(ValueError, match=rf"holds no experiments/\*\.json, and {name} would show nothing else"):
+            report(copied, tmp_path / name)
     assert table(page, "variant", "Spearman")
 
 

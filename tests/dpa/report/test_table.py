@@ -44,11 +44,16 @@ def test_top_p_is_a_column_only_where_it_is_known() -> None:
 
 
 def test_markdown_has_one_line_for_each_method_and_as_many_cells_everywhere(comparison: dict[str, Any]) -> None:
-    lines = to_markdown(comparison["rows"], comparison["paired"]).splitlines()
+    records = summarise(comparison["rows"], comparison["paired"])
+    lines = to_markdown(header(records), cells(records)).splitlines()
     assert len(lines) == 2 + 4
     assert len({line.count("|") for line in lines}) == 1
     assert "+0.018 [+0.006, +0.030]" in lines[4]
     assert "−0.004" in lines[5]
+
+
+def test_a_bar_in_a_name_does_not_split_a_cell_of_markdown() -> None:
+    assert to_markdown(["method", "realism"], [["a|b", "0.7"]]).splitlines()[2] == "| a\\|b | 0.7 |"
 
 
 def test_a_narrow_terminal_neither_folds_nor_cuts_a_number(comparison: dict[str, Any]) -> None:

@@ -1,0 +1,107 @@
+"""The tables of a study in Markdown, to put into a document: the numbers of the page, word for word."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+
+from dpa.report.experiment import Comparison, Experiment
+from dpa.report.findings import budgets, chosen_on_the_same, headline, left_out, ordering
+from dpa.report.sections.likelihood import DIGITS, FIGURES
+from dpa.report.study import Study
+from dpa.report.table import MISSING, cells, difference, duration, header, number, summarise, to_markdown
+
+
+def study_text(study: Study) -> str:
+    """Every experiment of a study: its finding, both tables, likelihoods, command, seeds and hours.
+
+    Args:
+        study: see :func:`dpa.report.study.read_study`.
+
+    Returns:
+        Markdown, with a heading of second level for each experiment and for the account.
+    """
+    parts = [block for experiment in study.experiments.values() for block in _experiment(experiment)]
+    return "\n\n".join([*parts, *_account(study.stages)]) + "\n"
+
+
+def _experiment(experiment: Experiment) -> Iterator[str]:
+    repeats = f" ({experiment.paper} of the paper)" if experiment.paper else ""
+    yield f"## {experiment.title}"
+    yield f"{experiment.question}{repeats}"
+    yield f"    {experiment.command}"
+    yield _made(experiment)
+    yield headline(experiment)
+    yield f"**Each at its own best decoding**, chosen on the {experiment.scenes['tune']} tuning scenes:"
+    yield comparison_table(experiment, experiment.own_best)
+    if told := ordering(experiment):
+        yield f"Against {experiment.labels[experiment.headline]}, {told}."
+    if remarks := [
+        told for told in (budgets(experiment), chosen_on_the_same(experiment), left_out(experiment)) if told
+    ]:
+        yield " ".join(remarks)
+    yield "**All at the common decoding**, and the reference at the others:"
+    yield comparison_table(experiment, experiment.at_common)
+    if experiment.likelihood:
+        yield "**Likelihood** of the reference's ranked rollouts, per token [nats]; KL along rollouts of the method:"
+        yield likelihood_table(experiment)
+
+
+def comparison_table(experiment: Experiment, comparison: Comparison) -> str:
+    """The results table of an experiment, with differences to the reference and to the headline's method.
+
+    Args:
+        experiment: that it is of.
+        comparison: one of its two.
+    """
+    records = comparison.records()
+    titles, rows = header(records), cells(records)
+    for record, row in zip(records, rows, strict=True):
+        row[0] = experiment.labels[record["method"]]
+    against = {entry["method"]: entry for entry in comparison.versus}
+    if against:
+        titles.append(f"Δ to {experiment.labels[experiment.headline]}")
+        for record, row in zip(records, rows, strict=True):
+            entry = against.get(record["method"], {})
+            row.append(difference(entry.get("realism_difference"), entry.get("ci95")))
+    if experiment.published:
+        titles.append("paper")
+        for record, row in zip(records, rows, strict=True):
+            row.append(number(experiment.published.get(record["method"], {}).get("realism"), 3))
+    return to_markdown(titles, rows)
+
+
+def likelihood_table(experiment: Experiment) -> str:
+    """Means over seeds of what every method thinks of ranked rollouts and logs.
+
+    Args:
+        experiment: with rows of likelihood.
+    """
+    records = summarise(experiment.likelihood)
+    shown = [key for key in FIGURES if any(record.get(key) is not None for record in records)]
+    rows = [
+        [experiment.labels[record["method"]], *(number(record[key], DIGITS.get(key, 3)) for key in shown)]
+        for record in records
+    ]
+    return to_markdown(["method", *(FIGURES[key] for key in shown)], rows)
+
+
+def _made(experiment: Experiment) -> str:
+    scenes = experiment.scenes
+    return (
+        f"{scenes['train']} training, {scenes['tune']} tuning and {scenes['eval']} evaluation scenes of "
+        f"{scenes['source']}; numbers are of the {experiment.reported}; seeds {', '.join(map(str, experiment.seeds))}; "
+        f"realism of {experiment.metric}; {experiment.date[:10] or MISSING}, commit "
+        f"{(experiment.revision or MISSING)[:10]}; {experiment.machine}; {duration(experiment.worker_seconds)} of one "
+        "worker. Differences are paired by scene and seed, with 95 % intervals over both."
+    )
+
+
+def _account(stages: Mapping[str, Mapping[str, float]]) -> Iterator[str]:
+    if not stages:
+        return
+    spent = {name: math.fsum(jobs.values()) for name, jobs in stages.items()}
+    rows = [[name, duration(seconds), str(len(stages[name]))] for name, seconds in spent.items()]
+    rows.append(["all", duration(sum(spent.values())), str(sum(map(len, stages.values())))])
+    yield "## Time of one worker"
+    yield to_markdown(["stage", "time", "jobs"], rows)

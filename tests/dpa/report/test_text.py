@@ -1,0 +1,80 @@
+"""The tables of a study as a document: the numbers of the files, each under its own title."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dpa.report.experiment import read_experiment
+from dpa.report.table import difference, number
+from recipes.report import report
+from tests.dpa.report.runs import write_runs
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_runs(tmp_path_factory.mktemp("study"))
+
+
+@pytest.fixture(scope="module")
+def text(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    out = tmp_path_factory.mktemp("text") / "new" / "tables.md"
+    assert report(runs, out) == out
+    return out.read_text(encoding="utf-8")
+
+
+def block(text: str, title: str) -> str:
+    """One experiment."""
+    return text.partition(f"## {title}\n")[2].partition("\n## ")[0]
+
+
+def rows_of(text: str, start: str) -> dict[str, dict[str, list[str]]]:
+    """The table after a line, ``{label: {column: cells}}``."""
+    lines = text.partition(start)[2].partition("\n\n")[2].partition("\n\n")[0].splitlines()
+    titles, _, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines)
+    found: dict[str, dict[str, list[str]]] = {}
+    for row in rows:
+        for title, cell in zip(titles, row, strict=True):
+            found.setdefault(row[0], {}).setdefault(title, []).append(cell)
+    return found
+
+
+def test_every_experiment_has_a_block_with_its_command_seeds_and_date(runs: Path, text: str) -> None:
+    for path in (runs / "experiments").glob("*.json"):
+        experiment = read_experiment(path)
+        told = block(text, experiment.title)
+        assert f"    {experiment.command}" in told and experiment.question in told
+        assert f"seeds {', '.join(map(str, experiment.seeds))}" in told and experiment.date[:10] in told
+
+
+def test_values_and_differences_are_those_of_the_files(runs: Path, text: str) -> None:
+    methods = read_experiment(runs / "experiments" / "methods.json")
+    told = block(text, methods.title)
+    for start, comparison in (("**Each", methods.own_best), ("**All", methods.at_common)):
+        table = rows_of(told, start)
+        for record in comparison.records():
+            shown = table[methods.labels[record["method"]]]
+            assert number(record["realism"], 3) in shown["realism ↑"]
+            assert difference(record["realism_difference"], record["ci95"]) in shown["Δ realism [95 %]"]
+    own = rows_of(told, "**Each")
+    for entry in methods.own_best.versus:
+        expected = difference(entry["realism_difference"], entry["ci95"])
+        assert own[methods.labels[entry["method"]]]["Δ to DPA-OMF"] == [expected]
+    assert own["DPA-OMF"]["paper"] == ["0.739"] and own["reference"]["paper"] == ["–"]
+
+
+def test_likelihoods_are_means_over_seeds(runs: Path, text: str) -> None:
+    methods = read_experiment(runs / "experiments" / "methods.json")
+    mine = [row["nll_preferred"] for row in methods.likelihood if row["method"] == "dpa_omf"]
+    table = rows_of(block(text, methods.title), "**Likelihood**")
+    assert table["DPA-OMF"]["NLL preferred"] == [number(sum(mine) / len(mine), 3)]
+
+
+def test_the_account_adds_up(text: str) -> None:
+    account = block(text, "Time of one worker")
+    assert "| pretrain | 1 h 30 min | 3 |" in account and "| all | 2 h 0 min | 12 |" in account
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])
