@@ -93,29 +93,22 @@ def train_policies(cfg: DictConfig, stages: Stages) -> None:
 
 
 def choose(cfg: DictConfig, stages: Stages) -> Chosen:
-    """Checkpoint and decoding of each method, by mean realism over seeds on the tuning scenes.
-
-    A checkpoint is chosen at the common decoding, then a decoding for it.
-    """
-    seeds, grid, common = list(cfg.seeds), decodings(cfg), Decoding(*cfg.decoding.common)
+    """Checkpoint and decoding of each method, both at once, by mean realism over seeds on the tuning scenes."""
     policies = {method: [method] for method in shown_policies(cfg)}
     if cfg.experiment.checkpoints == "select":
         policies |= {method: [*snapshots_of(cfg, method), method] for method in cfg.methods}
-
-    def tune(wanted: dict[str, list[tuple[str, Decoding]]]) -> None:
-        runs = {run for of_method in wanted.values() for run in of_method}
-        jobs = sorted((seed, policy, "tune", *spec(decoding)) for policy, decoding in runs for seed in seeds)
-        stages.run("tune", evaluate_job, cfg, jobs)
-
-    def best(runs: list[tuple[str, Decoding]]) -> tuple[str, Decoding]:
-        return max(runs, key=lambda run: tuning_realism(cfg, *run)) if len(runs) > 1 else runs[0]
-
-    candidates = {method: [(policy, common) for policy in among] for method, among in policies.items()}
-    tune({method: runs for method, runs in candidates.items() if len(runs) > 1})
-    checkpoint = {method: best(runs)[0] for method, runs in candidates.items()}
-    candidates = {method: [(policy, each) for each in grid] for method, policy in checkpoint.items()}
-    tune(candidates)
-    return Chosen(checkpoint, {method: best(runs)[1] for method, runs in candidates.items()})
+    runs = {
+        method: [(policy, decoding) for policy in among for decoding in decodings(cfg)]
+        for method, among in policies.items()
+    }
+    wanted = {run for of_method in runs.values() for run in of_method}
+    jobs = sorted((seed, policy, "tune", *spec(decoding)) for policy, decoding in wanted for seed in cfg.seeds)
+    stages.run("tune", evaluate_job, cfg, jobs)
+    best = {method: max(among, key=lambda run: tuning_realism(cfg, *run)) for method, among in runs.items()}
+    return Chosen(
+        {method: policy for method, (policy, _) in best.items()},
+        {method: decoding for method, (_, decoding) in best.items()},
+    )
 
 
 def measure(cfg: DictConfig, stages: Stages, chosen: Chosen) -> None:

@@ -5,14 +5,18 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
+from dpa.policy import Decoding
 from recipes.check import check_experiment
-from recipes.cli import CONFIG
-from recipes.compare import snapshots_of
+from recipes.cli import CONFIG, write_json
+from recipes.compare import choose, snapshots_of
+from recipes.jobs import runs_of
 from recipes.methods import read_setups
 from recipes.pool import Workers
 from recipes.stages import Stages, alone_in, read_account
@@ -106,6 +110,27 @@ def test_snapshots_end_before_the_last_step_of_their_method() -> None:
     cfg = configuration("alignment.snapshots=[40,150]", "+experiment.setup.dpa_omf={alignment:{steps:300}}")
     assert snapshots_of(cfg, "dpa_omf") == ["dpa_omf@40", "dpa_omf@150"]
     assert snapshots_of(cfg, "dpa_adef") == ["dpa_adef@40"]
+
+
+def test_checkpoint_and_decoding_are_chosen_together_by_the_mean_over_seeds(tmp_path: Path) -> None:
+    grid = "decoding.grid=[[1.0,1.0],[0.95,1.0]]"
+    cfg = configuration(
+        f"output={tmp_path}", "seeds=[0,1]", grid, "experiment.checkpoints=select", "alignment.snapshots=[40]"
+    )
+    # The snapshot is ahead at the common decoding and for seed 0; the last policy, at top-p 1, in the mean.
+    scores = {("dpa_omf@40", 0.95): (0.7, 0.3), ("dpa_omf", 1.0): (0.5, 0.6), ("reference", 0.95): (0.4, 0.4)}
+    asked = []
+
+    def evaluate(name: str, job: Any, config: Any, arguments: list[tuple]) -> None:
+        asked.extend(arguments)
+        for seed, policy, split, *decoding in arguments:
+            path = runs_of(config).evaluation(seed, policy, split, Decoding(*decoding))
+            write_json(path, {"mean": {"realism": scores.get((policy, decoding[0]), (0.1, 0.1))[seed]}})
+
+    chosen = choose(cfg, SimpleNamespace(run=evaluate))
+    assert (chosen.policies["dpa_omf"], chosen.decodings["dpa_omf"]) == ("dpa_omf", Decoding(1.0, 1.0))
+    assert (chosen.policies["reference"], chosen.decodings["reference"]) == ("reference", Decoding(0.95, 1.0))
+    assert len(asked) == len(set(asked)) == 2 * 2 * (1 + 2 * 5), "each policy of each seed once at each decoding"
 
 
 # --- the account ----------------------------------------------------------------------------------------------------
