@@ -1,9 +1,8 @@
 """One shard of a :class:`~envs.store.SceneStore`: a file of packed scenes behind each other, and a record of them.
 
-    magic | scene | scene | ... | record (JSON, packed) | length of the record | magic
-
-A scene is one block of :mod:`envs.codec` and is read alone, by one seek. The record at the end says where each one lies
-and what was learnt while it was made, so that a store can be searched and described without unpacking a scene.
+A scene is one block of :mod:`envs.codec` in the frame of :mod:`envs.framing`, read alone. The record at the end says
+where each one lies and what was learnt while it was made, so that a store can be searched and described without
+unpacking a scene.
 """
 
 from __future__ import annotations
@@ -11,18 +10,15 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import struct
 from collections import Counter
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from itertools import accumulate
 from pathlib import Path
 from typing import Any, TypeVar
 
-import zstandard
-
 from envs.card import Card
-from envs.codec import LEVEL, decode, encode
+from envs.codec import decode, encode
+from envs.framing import Framing
 from envs.scene import Scene, SceneError
 from envs.sources.fields import one_line, shown
 from envs.validation import check_scene_id
@@ -36,8 +32,6 @@ SUFFIX = ".scenes"
 PARTIAL_PREFIX = ".partial-"
 """Files that are being written; left over only by a process that was killed."""
 
-MAX_RECORD = 1 << 23
-"""Bytes of an unpacked record: that of 256 scenes has about 50,000, and decoded JSON can take forty times its size."""
 MAX_JSON = 1 << 27
 """Bytes of a manifest; one that lists a hundred thousand bad inputs has about 2^25."""
 
@@ -55,8 +49,7 @@ _RECORD_SHAPE = {
     "last": bool,
 }
 """Of the fields of :class:`ShardRecord`, see :func:`check_shape`."""
-_MAGIC = b"SCENES\x00" + bytes([FORMAT_VERSION])
-_FOOTER = struct.Struct(f"<Q{len(_MAGIC)}s")
+_FRAMING = Framing("shard", b"SCENES\x00" + bytes([FORMAT_VERSION]))
 
 
 @dataclass
@@ -146,9 +139,7 @@ class ShardWriter:
         """
         self.record.notes, self.record.card = dict(sorted(self.notes.items())), self._card.counts
         self.record.last = last
-        content = json.dumps({"version": FORMAT_VERSION, **asdict(self.record)}).encode()
-        packed = zstandard.ZstdCompressor(level=LEVEL, write_checksum=True).compress(content)
-        write_bytes(path, b"".join([_MAGIC, *self._blocks, packed, _FOOTER.pack(len(packed), _MAGIC)]))
+        write_bytes(path, _FRAMING.pack(self._blocks, {"version": FORMAT_VERSION, **asdict(self.record)}))
         return self.record
 
 
@@ -168,7 +159,7 @@ class Shard:
 
     @cached_property
     def _offsets(self) -> list[int]:
-        return list(accumulate(self.record.sizes, initial=len(_MAGIC)))
+        return _FRAMING.offsets(self.record.sizes)
 
     def scene(self, row: int) -> Scene:
         """One scene, as a copy of its own.
@@ -196,25 +187,18 @@ def read_record(path: Path) -> ShardRecord:
         SceneError: there is none, it is damaged or of another version.
     """
     try:
-        with path.open("rb") as file:
-            size = file.seek(0, os.SEEK_END)
-            file.seek(max(0, size - _FOOTER.size))
-            footer = file.read(_FOOTER.size)
-            length, magic = _FOOTER.unpack(footer) if len(footer) == _FOOTER.size else (0, b"")
-            if magic != _MAGIC or not 0 < length <= size - _FOOTER.size:
-                raise SceneError(f"{path}: no shard of version {FORMAT_VERSION}, or a cut one; convert again.")
-            file.seek(size - _FOOTER.size - length)
-            content = dict(json.loads(_unpacked(file.read(length))))
+        content, end = _FRAMING.read_record(path)
+        content = dict(content)
         if content.pop("version") != FORMAT_VERSION:
             raise SceneError(f"{path}: of another version than {FORMAT_VERSION}; convert the scenes again.")
         record = ShardRecord(**content)
-        _check_record(record, path, size - _FOOTER.size - length)
+        _check_record(record, path, end)
         return record
     except FileNotFoundError as error:
         raise SceneError(f"{path}: the file is missing; convert the scenes again.") from error
     except SceneError:
         raise
-    except (OSError, KeyError, RecursionError, TypeError, ValueError, zstandard.ZstdError) as error:
+    except (OSError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise SceneError(f"{path}: damaged ({one_line(error)}); convert the scenes again.") from error
 
 
@@ -226,8 +210,7 @@ def _check_record(record: ShardRecord, path: Path, end: int) -> None:
     for name in ("units", "sizes", "num_agents", "has_lights", "lacks"):
         if len(getattr(record, name)) != len(record.scene_ids):
             raise ValueError(f"{name} has not one value for each of {len(record.scene_ids)} scenes")
-    if len(_MAGIC) + sum(record.sizes) != end:
-        raise ValueError("sizes are not those of the scenes")
+    _FRAMING.check_sizes(record.sizes, end)
     for scene_id in record.scene_ids:
         check_scene_id(scene_id, str(path))
 
@@ -278,12 +261,6 @@ def _misfit(value: Any, shape: Any) -> tuple[str, Any] | None:
         if (found := _misfit(value[key], inner)) is not None:
             return f"[{shown(key)}]{found[0]}", found[1]
     return None
-
-
-def _unpacked(packed: bytes) -> bytes:
-    if not 0 <= zstandard.frame_content_size(packed) <= MAX_RECORD:
-        raise ValueError("a record of that size is none of ours")
-    return zstandard.ZstdDecompressor().decompress(packed)
 
 
 def file_digest(path: Path) -> str:

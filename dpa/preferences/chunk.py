@@ -1,41 +1,31 @@
 """One chunk of a preference store: a file of packed groups behind each other, and a record of them.
 
-    magic | group | group | ... | record (JSON, packed) | length of the record | magic
-
 The file is named after its content: its name says whether all of it is as it was, and no two writers, on whatever
-machines, can give one name to different chunks. A group is one block of :mod:`dpa.preferences.codec` and is read
-alone, by one seek.
+machines, can give one name to different chunks. A group is one block of :mod:`dpa.preferences.codec` in the frame of
+:mod:`envs.framing`, and is read alone.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
-import os
-import struct
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from itertools import accumulate
 from pathlib import Path
 from typing import NamedTuple
 
-import zstandard
-
-from dpa.preferences.codec import LEVEL, decode
+from dpa.preferences.codec import decode
 from dpa.preferences.group import Group
 from dpa.preferences.provenance import FORMAT, Provenance, StoreError
+from envs.framing import Framing
 from envs.shards import check_shape
 from envs.sources.fields import one_line
 
 PREFIX, SUFFIX = "chunk-", ".groups"
-MAX_RECORD = 1 << 23
-"""Bytes of an unpacked record: that of 64 groups has about 1,000."""
 MENDING = "delete it and collect again: the scenes that it held are done anew"
 
 _SHAPE = {"scenes": [int], "num_agents": [int], "sizes": [int], "num_features": int, "origin": str}
-_MAGIC = b"GROUPS\x00" + bytes([FORMAT])
-_FOOTER = struct.Struct(f"<Q{len(_MAGIC)}s")
+_FRAMING = Framing("chunk", b"GROUPS\x00" + bytes([FORMAT]))
 
 
 @dataclass(frozen=True)
@@ -59,7 +49,7 @@ class ChunkRecord:
     @cached_property
     def offsets(self) -> list[int]:
         """Where each group's block begins."""
-        return list(accumulate(self.sizes[:-1], initial=len(_MAGIC)))
+        return _FRAMING.offsets(self.sizes)
 
 
 class PackedGroup(NamedTuple):
@@ -85,8 +75,7 @@ def chunk_content(groups: Sequence[PackedGroup], origin: Provenance) -> bytes:
         num_features=groups[0].num_features,
         origin=origin.digest,
     )
-    packed = zstandard.ZstdCompressor(level=LEVEL, write_checksum=True).compress(json.dumps(asdict(record)).encode())
-    return b"".join([_MAGIC, *(group.block for group in groups), packed, _FOOTER.pack(len(packed), _MAGIC)])
+    return _FRAMING.pack([group.block for group in groups], asdict(record))
 
 
 def chunk_name(content: bytes) -> str:
@@ -110,19 +99,11 @@ def read_record(path: Path, origin: Provenance) -> ChunkRecord:
         StoreError: there is none, it is damaged, of another version, or of another store.
     """
     try:
-        with path.open("rb") as file:
-            size = file.seek(0, os.SEEK_END)
-            file.seek(max(0, size - _FOOTER.size))
-            footer = file.read(_FOOTER.size)
-            length, magic = _FOOTER.unpack(footer) if len(footer) == _FOOTER.size else (0, b"")
-            if magic != _MAGIC or not 0 < length <= size - _FOOTER.size:
-                raise ValueError(f"no chunk of format {FORMAT}, or a cut one")
-            file.seek(size - _FOOTER.size - length)
-            content = json.loads(_unpacked(file.read(length)))
+        content, end = _FRAMING.read_record(path)
         check_shape(content, _SHAPE, "its record")
         record = ChunkRecord(**content)
-        _check_record(record, size - _FOOTER.size - length)
-    except (OSError, RecursionError, ValueError, zstandard.ZstdError) as error:
+        _check_record(record, end)
+    except (OSError, RecursionError, ValueError) as error:
         raise StoreError(f"{path} is damaged ({one_line(error)}); {MENDING}.") from None
     if record.origin != origin.digest:
         raise StoreError(f"{path} belongs to another store; move it out of this one.")
@@ -164,11 +145,4 @@ def _check_record(record: ChunkRecord, end: int) -> None:
     """The record must fit itself and the blocks before it, which end at ``end``."""
     if not len(record.scenes) == len(record.num_agents) == len(record.sizes) > 0:
         raise ValueError("its record has not one size and number of agents for each scene")
-    if len(_MAGIC) + sum(record.sizes) != end:
-        raise ValueError("its record has not the sizes of its groups")
-
-
-def _unpacked(packed: bytes) -> bytes:
-    if not 0 <= zstandard.frame_content_size(packed) <= MAX_RECORD:
-        raise ValueError("a record of that size is none of ours")
-    return zstandard.ZstdDecompressor().decompress(packed, allow_extra_data=False)
+    _FRAMING.check_sizes(record.sizes, end)

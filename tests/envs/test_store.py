@@ -206,7 +206,7 @@ def test_another_version_is_refused(store: SceneStore) -> None:
 def test_a_shard_of_another_version_is_refused(store: SceneStore) -> None:
     path = store.folders[0] / "00000.scenes"
     path.write_bytes(path.read_bytes()[:-1] + b"\x01")
-    with pytest.raises(SceneError, match=r"00000\.scenes: no shard of version 2"):
+    with pytest.raises(SceneError, match=r"00000\.scenes: damaged \(no shard of version 2"):
         SceneStore(*store.folders)
 
 
@@ -268,7 +268,7 @@ def rewrite(path: Path, change_block: Callable = bytes, **changes: object) -> No
         ({"scene_ids": ["a", 7]}, r"scene_ids\[1\] is 7"),
         ({"scene_ids": ["a", "two\nlines"]}, r"scenario_id is 'two\\nlines'; must be text"),
         ({"sizes": [5, -5]}, r"sizes\[1\] is -5"),
-        ({"sizes": [5, 6]}, "sizes are not those of the scenes"),
+        ({"sizes": [5, 6]}, "sizes are not those of its blocks"),
         ({"num_agents": [2**80, 1]}, r"num_agents\[0\] is 1208\d+"),
         ({"units": [["made", 0, 0], ["made", 1]]}, r"units\[0\] is \["),
         ({"lacks": None}, "lacks is None"),
@@ -370,7 +370,7 @@ def test_verify_finds_one_changed_byte(store: SceneStore, name: str, place: floa
 def test_a_cut_shard_is_refused(store: SceneStore, cut: int) -> None:
     path = store.folders[0] / "00001.scenes"
     path.write_bytes(path.read_bytes()[:-cut])
-    with pytest.raises(SceneError, match=r"00001\.scenes: no shard of version 2, or a cut one"):
+    with pytest.raises(SceneError, match=r"00001\.scenes: damaged \(no shard of version 2, or a cut one"):
         Shard(path)
 
 
