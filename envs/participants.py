@@ -11,7 +11,7 @@ from torch import Tensor
 from envs.scene import CURRENT_STEP, LOG_STEPS, STEP_SECONDS, Agents, Scene, SceneSource, select_agents
 
 MAX_CONTROLLED = 128
-"""Agents of one scene that a policy moves at most (WOSAC; SPEC section 1.2)."""
+"""Agents of one scene that a policy moves at most (WOSAC; realism.md section 1.2)."""
 
 ControlName = Literal["all", "sdc", "predict"]
 Control = ControlName | Callable[[Scene], Tensor]

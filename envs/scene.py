@@ -98,7 +98,7 @@ class LightState(IntEnum):
 
 
 RED_STATES = (LightState.ARROW_STOP, LightState.STOP)
-"""States at which vehicles may not pass the stop point (SPEC section 4.2)."""
+"""States at which vehicles may not pass the stop point (realism.md section 4.2)."""
 
 
 class Lacks(IntFlag):
@@ -171,12 +171,12 @@ class Agents(TensorClass["nocast"]):
 
     @property
     def present(self) -> Tensor:
-        """``[*, A]`` bool: valid at the current step; the agents of a simulation (SPEC section 1.2)."""
+        """``[*, A]`` bool: valid at the current step; the agents of a simulation (realism.md section 1.2)."""
         return self.valid[..., CURRENT_STEP]
 
     @property
     def evaluated(self) -> Tensor:
-        """``[*, A]`` bool: the SDC and the tracks to predict (SPEC section 1.3)."""
+        """``[*, A]`` bool: the SDC and the tracks to predict (realism.md section 1.3)."""
         return self.sdc | self.predict
 
 

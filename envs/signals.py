@@ -1,7 +1,7 @@
 """What happened in a decision, agent by agent: collisions, leaving the road, progress, red lights.
 
 A signal is a function of a :class:`Decision`, registered under a name; :class:`~envs.traffic.TrafficEnv` computes
-those that it is asked for and no other. Geometry and rules are those of the realism metric (SPEC sections 3 and 4),
+those that it is asked for and no other. Geometry and rules are those of the realism metric (realism.md 3 and 4),
 without the accidents of its code.
 """
 
@@ -144,7 +144,7 @@ def signal(name: str, *, dtype: torch.dtype, lifted: bool = False) -> Callable[[
 
 @signal("collision", dtype=torch.bool)
 def collision(decision: Decision) -> Tensor:
-    """The agent's box overlaps the box of another agent in some pose (SPEC section 3.1)."""
+    """The agent's box overlaps the box of another agent in some pose (realism.md section 3.1)."""
     size = decision.agents.extent[:, None, :, None, :2].expand(*decision.poses.shape[:-1], 2)
     boxes = torch.cat((decision.poses, size), -1)[..., 1:, :].transpose(2, 3)
     nearest = nearest_box_distance(boxes, decision.valid[..., 1:].transpose(2, 3))
@@ -153,7 +153,7 @@ def collision(decision: Decision) -> Tensor:
 
 @signal("offroad", dtype=torch.bool, lifted=True)
 def offroad(decision: Decision) -> Tensor:
-    """A corner of the agent's box is off the road in some pose (SPEC section 4.1)."""
+    """A corner of the agent's box is off the road in some pose (realism.md section 4.1)."""
     off = torch.zeros_like(decision.valid[..., 1:])
     position = torch.cat((decision.poses[..., :2], decision.height[..., None]), -1)[..., 1:, :]
     heading = decision.poses[..., 1:, 2]
@@ -180,7 +180,7 @@ def progress(decision: Decision) -> Tensor:
 
 @signal("red_light", dtype=torch.bool)
 def red_light(decision: Decision) -> Tensor:
-    """The agent passes the stop point of the lane that it is on while the light is red (SPEC section 4.2)."""
+    """The agent passes the stop point of the lane that it is on while the light is red (realism.md section 4.2)."""
     crossed = torch.zeros_like(decision.valid[..., 1:])
     steps = crossed.shape[-1]
     for scene, road in enumerate(decision.maps):

@@ -1,4 +1,4 @@
-"""Align a policy with the preferences among its own rollouts (METHOD sections 5 and 6).
+"""Align a policy with the preferences among its own rollouts (method.md sections 5 and 6).
 
     python -m recipes.align method=dpa_omf policy=runs/pretrain/policy.pt preferences=runs/preferences
     torchrun --nproc-per-node 2 -m recipes.align method=dpa_omf policy=FILE preferences=DIR  # docs/scale.md

@@ -1,4 +1,4 @@
-"""What each method learns from: pairs, sets, rankings or targets, out of a preference store (METHOD section 6)."""
+"""What each method learns from: pairs, sets, rankings or targets, out of a preference store (method.md section 4)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Roll a policy out, rank its rollouts against the log, and keep them as preferences (METHOD sections 3 and 4).
+"""Roll a policy out, rank its rollouts against the log, and keep them as preferences (method.md sections 3 and 4).
 
     python -m recipes.collect policy=runs/pretrain/policy.pt
     python -m dpa.preferences info runs/preferences

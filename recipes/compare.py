@@ -1,4 +1,4 @@
-"""Experiments: from scenes to a comparison of methods, for several seeds (METHOD sections 6 to 8).
+"""Experiments: from scenes to a comparison of methods, for several seeds (method.md section 6, docs/experiments.md).
 
     python -m recipes.compare scenes=gpudrive scenes.train=DIR scenes.eval=DIR output=runs/real
     python -m recipes.compare experiment=features output=runs/real ...   # another question to the same references

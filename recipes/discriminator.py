@@ -1,4 +1,4 @@
-"""What does a discriminator rank rollouts by (METHOD figure 10)?
+"""What does a discriminator rank rollouts by (figure 10 of the paper)?
 
 python -m recipes.discriminator policies=[runs/pretrain/policy.pt]
 

@@ -1,4 +1,4 @@
-"""Score a policy: WOSAC realism, minADE, collisions, off-road, the preference distance (METHOD section 7), and safety.
+"""Score a policy: WOSAC realism, minADE, collisions, off-road, the preference distance, and safety.
 
 python -m recipes.evaluate policy=runs/pretrain/policy.pt decoding.top_p=0.9 json=runs/reference.json
 """

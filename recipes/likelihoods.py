@@ -1,4 +1,4 @@
-"""How likely logs, preferred and unpreferred rollouts are under a policy (METHOD table 3, figures 4, 6 and 7)."""
+"""How likely logs, preferred and unpreferred rollouts are under a policy (table 3 of the paper, figures 4, 6 and 7)."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def divergence(
     memory: float = 0.25,
     device: str = "cpu",
 ) -> list[float]:
-    """KL(model || reference) per token [nats] of each scene, in order (METHOD figure 7, right).
+    """KL(model || reference) per token [nats] of each scene, in order (figure 7 of the paper, right).
 
     The expectation is taken over the model's own rollouts, drawn from its whole distribution, and is exact within each
     token.

@@ -1,4 +1,4 @@
-"""Scenes and rollouts of an experiment's policies for the player of the page (METHOD figures 5, 8 and 9)."""
+"""Scenes and rollouts of an experiment's policies for the player of the page (figures 5, 8 and 9 of the paper)."""
 
 from __future__ import annotations
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, fields
+from itertools import combinations
 from pathlib import Path
 
 import torch
@@ -22,7 +23,7 @@ class Splits:
 
     Attributes:
         train: scenes that losses see.
-        tune: a part of the training files that no loss sees.
+        tune: scenes that no loss sees, for checkpoints and decoding.
         eval: scenes of files of their own.
     """
 
@@ -44,25 +45,35 @@ def open_splits(cfg: DictConfig) -> Splits:
     """Open the splits that ``cfg.scenes`` describes, converting what is not converted yet.
 
     ``train`` and ``eval`` are what :func:`envs.convert.convert` takes for the source, or folders of stores for the
-    source ``store``. ``tune`` scenes are drawn from the training scenes with ``split_seed``.
+    source ``store``. So may be ``tune``; as a number it is so many of the training scenes, drawn with ``split_seed``.
 
     Raises:
-        ValueError: fewer training scenes than ``tune`` asks for, or scenes that are both trained and evaluated on.
+        ValueError: fewer training scenes than ``tune`` asks for, or scenes that are in two splits.
     """
-    pool, held_out = (_chosen(_open(cfg, cfg[split]), cfg.select, split) for split in ("train", "eval"))
-    shared = sorted(set(pool.scene_ids) & set(held_out.scene_ids))
-    if shared:
-        raise ValueError(f"scenes.train and scenes.eval share {len(shared)} scenes (the first is {shared[0]!r}).")
-    if not 0 < cfg.tune < len(pool):
+    train, held_out = (_chosen(_open(cfg, cfg[split]), cfg.select, split) for split in ("train", "eval"))
+    if isinstance(cfg.tune, int):
+        train, tune = _drawn(train, cfg.tune, cfg.split_seed)
+    else:
+        tune = _chosen(_open(cfg, cfg.tune), cfg.select, "tune")
+    for (one, first), (other, second) in combinations({"train": train, "tune": tune, "eval": held_out}.items(), 2):
+        if shared := sorted(set(first.scene_ids) & set(second.scene_ids)):
+            raise ValueError(
+                f"scenes.{one} and scenes.{other} share {len(shared)} scenes (the first is {shared[0]!r})."
+            )
+    if cfg.limit is not None:
+        train, held_out = (scenes.subset(range(min(cfg.limit, len(scenes)))) for scenes in (train, held_out))
+    return Splits(train, tune, held_out)
+
+
+def _drawn(pool: SceneStore, count: int, seed: int) -> tuple[SceneStore, SceneStore]:
+    """The scenes to train on, and ``count`` others."""
+    if not 0 < count < len(pool):
         raise ValueError(
             f"scenes.tune, taken from the {len(pool)} scenes of scenes.train, must leave some to train on, got "
-            f"{cfg.tune}; say for example scenes.tune={max(1, len(pool) // 5)}."
+            f"{count}; say for example scenes.tune={max(1, len(pool) // 5)}."
         )
-    order = torch.randperm(len(pool), generator=make_generator(cfg.split_seed, "tune")).tolist()
-    tune, train = sorted(order[: cfg.tune]), sorted(order[cfg.tune :])
-    if cfg.limit is not None:
-        train, held_out = train[: cfg.limit], held_out.subset(range(min(cfg.limit, len(held_out))))
-    return Splits(pool.subset(train), pool.subset(tune), held_out)
+    order = torch.randperm(len(pool), generator=make_generator(seed, "tune")).tolist()
+    return pool.subset(sorted(order[count:])), pool.subset(sorted(order[:count]))
 
 
 def fingerprint(scenes: SceneStore) -> str:

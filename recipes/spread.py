@@ -1,4 +1,4 @@
-"""How far each feature of rollouts lies from that of the log, and what share of the cost follows (METHOD section 3).
+"""How far each feature of rollouts lies from that of the log, and what share of the cost follows (method.md section 3).
 
     python -m recipes.collect policy=runs/pretrain/policy.pt
     python -m recipes.spread policy=runs/pretrain/policy.pt preferences=runs/preferences

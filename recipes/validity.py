@@ -1,4 +1,4 @@
-"""Does a distance to the log tell realism (METHOD figure 3)?
+"""Does a distance to the log tell realism (figure 3 of the paper)?
 
 python -m recipes.validity policies=[runs/pretrain/policy.pt]
 

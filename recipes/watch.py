@@ -1,4 +1,4 @@
-"""A look at a policy in training: scenes that no loss sees (METHOD figures 4 and 6)."""
+"""A look at a policy in training: scenes that no loss sees (figures 4 and 6 of the paper)."""
 
 from __future__ import annotations
 

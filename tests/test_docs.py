@@ -208,6 +208,20 @@ def test_every_file_that_is_named_exists(page: Path) -> None:
     assert not [path for path in named if not (REPOSITORY / path).exists()]
 
 
+@pytest.mark.parametrize("page", ["method.md", "realism.md"])
+def test_every_section_that_code_cites_exists(page: str) -> None:
+    text = (REPOSITORY / "docs" / page).read_text(encoding="utf-8")
+    known = set(re.findall(r"^(?:## |- \*\*)(\d(?:\.\d)?)", text, re.MULTILINE))
+    cited = re.compile(rf"{re.escape(page)} (?:sections? )?(\d(?:\.\d)?)(?: (?:and|to) (\d(?:\.\d)?))?")
+    found = 0
+    for package in ("dpa", "envs", "recipes", "tests"):
+        for path in (path for kind in ("*.py", "*.yaml") for path in (REPOSITORY / package).rglob(kind)):
+            for match in cited.finditer(path.read_text(encoding="utf-8")):
+                found += 1
+                assert known.issuperset(filter(None, match.groups())), f"{path}: {match.group()}"
+    assert found > 5
+
+
 def test_the_page_of_keys_lists_every_key() -> None:
     text = (REPOSITORY / "docs" / "keys.md").read_text(encoding="utf-8")
     constants = [constant for constant in vars(keys) if constant.isupper()]

@@ -1,4 +1,4 @@
-"""Contrastive preference losses over pairs of rollouts: CPL (METHOD eq. 4), DPO, IPO, SimPO, and by agent."""
+"""Contrastive preference losses over pairs of rollouts: CPL (eq. 4 of the paper), DPO, IPO, SimPO, and by agent."""
 
 from __future__ import annotations
 

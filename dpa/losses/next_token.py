@@ -1,4 +1,4 @@
-"""Next-token prediction (METHOD eq. 1)."""
+"""Next-token prediction (eq. 1 of the paper)."""
 
 from __future__ import annotations
 

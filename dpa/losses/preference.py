@@ -75,7 +75,7 @@ class Comparison(NamedTuple):
 class PreferenceLoss(LossModule):
     """Teacher-forced scores of preferred and unpreferred rollouts of scenes; a subclass says what they cost.
 
-    The score of a rollout is ``A = alpha * reduce(log pi - log pi_ref)`` over its valid tokens (METHOD section 5). A
+    The score of a rollout is ``A = alpha * reduce(log pi - log pi_ref)`` over its valid tokens (method.md section 5). A
     subclass writes :meth:`compare` and, where rollouts are not compared pair by pair, :attr:`sides`.
 
     A step takes a pass of the policy and one, without gradients, of the reference: a frozen copy of the network as it

@@ -1,4 +1,4 @@
-"""Notices when a preference loss no longer weighs preferences, and says what to change (METHOD section 5)."""
+"""Notices when a preference loss no longer weighs preferences, and says what to change (method.md section 5)."""
 
 from __future__ import annotations
 

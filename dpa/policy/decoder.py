@@ -1,4 +1,4 @@
-"""Causal decoder over agents x decisions, with a cache (METHOD section 2).
+"""Causal decoder over agents x decisions, with a cache (method.md section 2).
 
 A *node* is an agent at the start of a decision. It knows the motion that it just made (its last token), when it is and
 who it is. It attends to the nodes of all agents up to its own decision, which hold the tokens of earlier decisions only

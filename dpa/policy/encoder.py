@@ -1,4 +1,4 @@
-"""Early-fusion scene encoder: map pieces, lights and agent histories become one row of tokens (METHOD section 2)."""
+"""Early-fusion scene encoder: map pieces, lights and agent histories become one row of tokens (method.md section 2)."""
 
 from __future__ import annotations
 

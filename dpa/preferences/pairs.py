@@ -139,7 +139,7 @@ def separated(
 
 
 def thin_out(kept: Tensor, rankings: float, generator: torch.Generator) -> Tensor:
-    """Choose r rankings per training example (METHOD section 4; figure 7, left).
+    """Choose r rankings per training example (method.md section 4; figure 7, left).
 
     A ranking is a pair and a training example is a scene: every scene gives floor(r) pairs, and a share r - floor(r)
     of the scenes one more, so that r is the mean. Below 1 only a share r of the scenes is learnt from. A scene with

@@ -23,7 +23,7 @@ def average_displacement(position: Tensor, log: Tensor, valid: Tensor) -> Displa
     """Average displacement error (ADE) over the logged future.
 
     The realism benchmark's minADE is another number: it is three-dimensional and counts the ten steps of history and
-    the current one, where the error is 0 (SPEC section 5).
+    the current one, where the error is 0 (realism.md section 5).
 
     Args:
         position: ``[R, A, T, 2]`` or more coordinates, of which the first two count [m].

@@ -23,7 +23,7 @@ BUCKETS: dict[str, tuple[str, ...]] = {
     "interactive": ("distance_to_nearest_object", "collision_indication", "time_to_collision"),
     "map_based": ("distance_to_road_edge", "offroad_indication", "traffic_light_violation"),
 }
-"""Metrics of each part of the meta-metric (SPEC section 7)."""
+"""Metrics of each part of the meta-metric (realism.md section 7)."""
 CONTINUOUS = (*BUCKETS["kinematic"], "distance_to_nearest_object", "time_to_collision", "distance_to_road_edge")
 INDICATORS = ("collision_indication", "offroad_indication", "traffic_light_violation")
 

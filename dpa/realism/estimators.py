@@ -1,4 +1,4 @@
-"""Likelihood of logged values under a distribution that is estimated from rollouts (SPEC section 6)."""
+"""Likelihood of logged values under a distribution that is estimated from rollouts (realism.md section 6)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def log_likelihood(
     """Score each logged value against a distribution of simulated values.
 
     By default each agent has one distribution of all its steps in all rollouts; ``config.pooled`` shares it among
-    agents and ``config.per_step`` gives each step one of its own (SPEC section 6.1).
+    agents and ``config.per_step`` gives each step one of its own (realism.md section 6).
 
     Args:
         log: ``[E, T]``.
@@ -55,7 +55,7 @@ def _groups(log: Tensor, config: Histogram | Kernel) -> Tensor:
 
 
 def _histogram(log: Tensor, group: Tensor, samples: Tensor, sample_group: Tensor, config: Histogram) -> Tensor:
-    """Log of the smoothed share of samples in the bin of each logged value (SPEC section 6.2)."""
+    """Log of the smoothed share of samples in the bin of each logged value (realism.md section 6)."""
     groups = int(group.max()) + 1
     # every distribution has its own row of bins in one flat count
     count = torch.bincount(_bin(samples, config) + sample_group * config.bins, minlength=groups * config.bins)
@@ -65,7 +65,7 @@ def _histogram(log: Tensor, group: Tensor, samples: Tensor, sample_group: Tensor
 
 
 def _kernel(log: Tensor, group: Tensor, samples: Tensor, sample_group: Tensor, config: Kernel) -> Tensor:
-    """Log of the mean kernel between the samples and each logged value; 0 at most (SPEC section 6.4)."""
+    """Log of the mean kernel between the samples and each logged value; 0 at most (realism.md section 6)."""
     score = torch.full_like(log, torch.nan)
     for each in group.unique():
         own, values = group == each, samples[sample_group == each]

@@ -1,6 +1,6 @@
 """What the realism metric measures of every evaluated agent, at each step, in the log and in the rollouts.
 
-Sections refer to the specification of the Waymo Open Sim Agents metric (SPEC).
+Sections are those of docs/realism.md, which specifies the Waymo Open Sim Agents metric.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def _speed(position: Tensor, kind: Differences) -> Tensor:
 
 
 def _kinematics(tracks: Tracks, config: RealismConfig) -> dict[str, Tensor]:
-    """Speeds and accelerations of the evaluated agents (SPEC section 2)."""
+    """Speeds and accelerations of the evaluated agents (realism.md section 2)."""
     ego = slice(tracks.num_ego)
     position, heading = tracks.position[:, ego], tracks.heading[:, ego]
     if Quirk.INVALID_AT_ORIGIN not in config.quirks:
@@ -150,7 +150,7 @@ def _kinematics(tracks: Tracks, config: RealismConfig) -> dict[str, Tensor]:
 
 
 def _nearest_object(tracks: Tracks, rounding: float) -> Tensor:
-    """Signed distance of the evaluated agents to the nearest other box (SPEC section 3.1) -> ``[C, E, T]`` [m]."""
+    """Signed distance of the evaluated agents to the nearest other box (realism.md 3.1) -> ``[C, E, T]`` [m]."""
     pose = torch.cat((tracks.position[..., :2], tracks.heading[..., None]), -1)[:, :, tracks.scored]
     size = tracks.extent[:, :, None, :2].expand(-1, -1, pose.shape[2], -1)
     boxes = torch.cat((pose, size), -1).transpose(1, 2)
@@ -160,7 +160,7 @@ def _nearest_object(tracks: Tracks, rounding: float) -> Tensor:
 
 
 def _time_to_collision(tracks: Tracks, config: RealismConfig) -> Tensor:
-    """Time until evaluated agents reach their leaders at present speeds (SPEC section 3.2) -> ``[C, E, T]`` [s]."""
+    """Time until evaluated agents reach their leaders at present speeds (realism.md 3.2) -> ``[C, E, T]`` [s]."""
     speed = _speed(tracks.position[..., :2], config.differences)[..., tracks.scored]
     position, heading = tracks.position[:, :, tracks.scored, :2], tracks.heading[:, :, tracks.scored]
     valid = tracks.valid[:, :, tracks.scored]
@@ -176,7 +176,7 @@ def _time_to_collision(tracks: Tracks, config: RealismConfig) -> Tensor:
 
 
 def _road_edge(tracks: Tracks, scene: Scene, config: RealismConfig) -> Tensor:
-    """Signed distance of the evaluated agents to the road edge (SPEC section 4.1) -> ``[C, E, T]`` [m]."""
+    """Signed distance of the evaluated agents to the road edge (realism.md section 4.1) -> ``[C, E, T]`` [m]."""
     edges = RoadEdges.from_polylines(
         polylines(scene, EDGE_KINDS),
         every_ring=Quirk.LONGEST_RING not in config.quirks,
@@ -193,7 +193,7 @@ def _road_edge(tracks: Tracks, scene: Scene, config: RealismConfig) -> Tensor:
 
 
 def _red_lights(tracks: Tracks, scene: Scene, config: RealismConfig) -> Tensor:
-    """Steps at which the evaluated agents drive through red lights (SPEC section 4.2) -> ``[C, E, T]`` bool."""
+    """Steps at which the evaluated agents drive through red lights (realism.md section 4.2) -> ``[C, E, T]`` bool."""
     # A crossing compares a step with the one before it; nothing is crossed at the first step of a generated scene.
     before, ego = max(tracks.context - 1, 0), slice(tracks.num_ego)
     position, valid = tracks.position[:, ego, before:, :2], tracks.valid[:, ego, before:]
@@ -202,7 +202,7 @@ def _red_lights(tracks: Tracks, scene: Scene, config: RealismConfig) -> Tensor:
 
 
 def _displacement(scene: Scene, simulated: Tensor, num_ego: int, with_history: bool) -> Tensor:
-    """Mean distance from the log (SPEC section 5) -> ``[R, E]`` [m]; NaN where the log has no step."""
+    """Mean distance from the log (realism.md section 5) -> ``[R, E]`` [m]; NaN where the log has no step."""
     position, valid = scene.agents.position[:num_ego], scene.agents.valid[:num_ego]
     error = (simulated[:, :num_ego, :, :3] - position[:, -HORIZON:]).norm(dim=-1)
     steps = valid if with_history else valid[:, -HORIZON:]

@@ -1,4 +1,4 @@
-"""Driving through red lights, as the 2025 challenge counts it (SPEC section 4.2)."""
+"""Driving through red lights, as the 2025 challenge counts it (realism.md section 4.2)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Likelihood of the log under the rollouts, feature by feature and event by event (SPEC sections 6 and 7)."""
+"""Likelihood of the log under the rollouts, feature by feature and event by event (realism.md sections 6 and 7)."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _masks(measured: Features, config: RealismConfig) -> dict[str, Tensor]:
 
 
 def _with_neighbours(valid: Tensor, differences: Differences) -> Tensor:
-    """Steps whose difference is known (SPEC sections 2.3 and 8): ``[E, T]`` -> ``[E, T]``."""
+    """Steps whose difference is known (realism.md sections 2.3 and 8): ``[E, T]`` -> ``[E, T]``."""
     result = torch.zeros_like(valid)
     if differences == "central":
         result[:, 1:-1] = valid[:, :-2] & valid[:, 2:]

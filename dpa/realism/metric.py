@@ -1,4 +1,4 @@
-"""From measurements to the realism meta-metric of the Waymo Open Sim Agents Challenge (SPEC section 7)."""
+"""From measurements to the realism meta-metric of the Waymo Open Sim Agents Challenge (realism.md section 7)."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ class Quirk(StrEnum):
     """
 
     NAN_IN_LAST_BIN = "nan_in_last_bin"
-    """Differences that do not exist (at the end of a rollout) count in the last bin (SPEC 2.1); clean: they do not."""
+    """Differences that do not exist (a rollout's end) count in the last bin (realism.md 2.1); clean: they do not."""
 
     UNMASKED_SAMPLES = "unmasked_samples"
     """Rollouts are counted at steps that the log lacks too (6.2); clean: at the steps at which the log is scored."""

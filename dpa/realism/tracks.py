@@ -1,7 +1,7 @@
 """Who is compared where: the log of a scene and rollouts of it, side by side, for one scene or several.
 
-Sections refer to the specification of the Waymo Open Sim Agents metric (SPEC). The log is treated as one more rollout,
-so everything is computed once for ``C = R + 1`` scenes, the log first.
+Sections are those of docs/realism.md, which specifies the Waymo Open Sim Agents metric. The log is treated as one
+more rollout, so everything is computed once for ``C = R + 1`` scenes, the log first.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from envs.scene import CURRENT_STEP, LOG_STEPS, AgentKind, LightState, Scene, se
 HORIZON = LOG_STEPS - CURRENT_STEP - 1
 """Simulated steps, and steps that are scored."""
 _CONTEXT = 2
-"""Logged steps ahead of the scored ones that their differences reach back to (SPEC section 2.2)."""
+"""Logged steps ahead of the scored ones that their differences reach back to (realism.md section 2.2)."""
 
 
 class Generated(NamedTuple):
@@ -91,7 +91,7 @@ def compare(scene: Scene, simulated: Tensor, config: RealismConfig, generated: G
     scene = select_agents(scene, scene.agents.present)
     agents = scene.agents
     evaluated = torch.ones_like(agents.evaluated) if config.scenario_generation else agents.evaluated
-    # Evaluated agents first, in ascending order of their ids (SPEC sections 1.3 and 1.4).
+    # Evaluated agents first, in ascending order of their ids (realism.md section 1.3).
     order = agents.track_id.argsort()
     order = torch.cat((order[evaluated[order]], order[~evaluated[order]]))
     scene, simulated, num_ego = select_agents(scene, order), simulated[:, order], int(evaluated.sum())
@@ -127,7 +127,7 @@ def to_world(scene: Scene, simulated: Tensor) -> tuple[Scene, Tensor]:
     """Give one uncollated scene and its rollouts the coordinates that the official code works on.
 
     Those are the source's own in float32, and zero for all that is invalid or absent. This zero matters: accelerations
-    reach back to invalid history, and red lights to absent stop points (SPEC sections 2.2 and 4.2).
+    reach back to invalid history, and red lights to absent stop points (realism.md sections 2.2 and 4.2).
 
     Args:
         scene: a scene.
@@ -151,7 +151,7 @@ def to_world(scene: Scene, simulated: Tensor) -> tuple[Scene, Tensor]:
 
 
 def _join(scene: Scene, simulated: Tensor, num_ego: int, ghosts: bool) -> Tracks:
-    """Put the log, then the rollouts behind their logged context, side by side (SPEC section 1.6)."""
+    """Put the log, then the rollouts behind their logged context, side by side (realism.md section 1.6)."""
     agents = scene.agents
     steps = slice(-HORIZON - _CONTEXT, None)
     valid = agents.valid[:, steps]
@@ -176,7 +176,7 @@ def _join(scene: Scene, simulated: Tensor, num_ego: int, ghosts: bool) -> Tracks
 
 
 def _join_generated(scene: Scene, simulated: Tensor, num_ego: int, generated: Generated | None) -> Tracks:
-    """Put the log and the generated scenes side by side (SPEC section 7): all 91 steps, all agents, always valid."""
+    """Put the log and the generated scenes side by side (realism.md 7): all 91 steps, all agents, always valid."""
     agents, rollouts = scene.agents, simulated.shape[0]
     extent, kind = agents.extent.expand(rollouts, -1, -1), agents.kind.expand(rollouts, -1)
     if generated is not None:

@@ -114,7 +114,7 @@ def couple_agent(distance: PreferenceDistance, scene: Scene, trajectory: Tensor,
 def plot_coupling(
     scene: Scene, trajectory: Tensor, agent: int, coupled: AgentCoupling, path: str | Path, *, title: str
 ) -> None:
-    """Draw one agent: both tracks, the coupling, what each feature adds, and the features over time (METHOD figure 2).
+    """Draw one agent: both tracks, the coupling, what each feature adds, and the features over time (figure 2).
 
     The colour of a track and of the edges of the matrix is time. In the matrix, grey is the cost of a pair of steps and
     dots are the coupling; a rollout like its log keeps to the diagonal, and steps that the log lacks are sand-coloured.

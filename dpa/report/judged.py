@@ -1,6 +1,6 @@
 """Rollouts of one scene with what a viewer asks of them: how near, how likely, who collides, and what is like the log.
 
-Many rollouts are judged and few are kept: the most likely one (METHOD figures 5 and 9), and some from the nearest to
+Many rollouts are judged and few are kept: the most likely one (figures 5 and 9), and some from the nearest to
 the farthest.
 """
 

@@ -66,7 +66,7 @@ def incidents(scene: Scene, trajectories: Tensor, agents: Tensor) -> Incidents:
 def plot_ranked(
     scene: Scene, trajectories: Tensor, distance: Tensor, agents: Tensor, path: str | Path, *, each: int = 3
 ) -> None:
-    """Draw the log, and beside it the nearest and the farthest rollouts of a scene (METHOD figure 8).
+    """Draw the log, and beside it the nearest and the farthest rollouts of a scene (figure 8 of the paper).
 
     Args:
         scene: an uncollated scene.

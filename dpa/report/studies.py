@@ -14,7 +14,7 @@ from dpa.report.statistics import Interval
 
 
 def plot_validity(found: Mapping[str, Mapping[str, Any]], path: str | Path) -> None:
-    """Draw realism against mean distance, window by window, for each ranking (METHOD figure 3).
+    """Draw realism against mean distance, window by window, for each ranking (figure 3 of the paper).
 
     Left the curves with their 95 % bands: distance over the scene's mean, realism minus that of rollouts drawn at
     random. Right the rank correlation of both within a scene.
@@ -77,7 +77,7 @@ def plot_sensitivity(
 
 
 def plot_discriminator(found: Mapping[str, Any], path: str | Path) -> None:
-    """Draw what a discriminator ranks rollouts by, beside the preference distance and ADE (METHOD figure 10).
+    """Draw what a discriminator ranks rollouts by, beside the preference distance and ADE (figure 10 of the paper).
 
     Left Spearman of the score with what was measured of a rollout; below 0 the ranking prefers less of it. Right the
     realism of the best and of the worst quarter, minus that of random groups.

@@ -1,4 +1,4 @@
-"""The results table: METHOD's table 1, safety rates and the paired difference, for a terminal, a document or a page."""
+"""The results table: that of the paper, safety rates and the paired difference, for terminal, document and page."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ COLUMNS = (
     Column("preference_distance", "distance", 2, "↓"),
     Column("pair_accuracy", "pair acc.", 3, "↑"),
 )
-"""Measures in the order of METHOD table 1, then safety, then the preference distance and table 3's accuracy."""
+"""Measures in the order of table 1 of the paper, then safety, then the preference distance and table 3's accuracy."""
 
 DIFFERENCE_TITLE = "Δ realism [95 %]"
 IDENTITY = ("method", "seed", "top_p", "temperature", "file", "n_scenes")

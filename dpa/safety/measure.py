@@ -27,7 +27,7 @@ def safety(scene: Scene, trajectories: Tensor, controlled: Tensor) -> dict[str, 
 
     Nothing here is part of the preference distance of the paper or of the realism metrics of 2023 and 2024, so neither
     alignment nor the choice of a decoding has seen it. Those of 2025 weigh driving through red lights, in a way of
-    their own (SPEC section 4.2): with them ``red_light`` is a measure that the choice has seen. The log is measured by
+    their own (realism.md 4.2): with them ``red_light`` is a measure that the choice has seen. The log is measured by
     the same function, as the one rollout.
 
     Args:

@@ -74,7 +74,7 @@ class MotionTokenizer(nn.Module):
         noise: float = 0.0,
         generator: torch.Generator | None = None,
     ) -> TokenizedTracks:
-        """Tokenize tracks greedily on the reconstructed track, so that errors do not add up (METHOD section 2).
+        """Tokenize tracks greedily on the reconstructed track, so that errors do not add up (method.md section 2).
 
         A token is valid up to the first decision in which the log misses its last pose. With ``noise``, some tokens
         are replaced by neighbours and the labels lead back to the log: whoever learns the labels learns to recover

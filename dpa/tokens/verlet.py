@@ -39,7 +39,7 @@ def _by_kind(name: str, values: Mapping[str, object], width: int) -> Tensor:
 
 
 class VerletTokenizer(MotionTokenizer):
-    """13 x 13 changes of the displacement per decision (MotionLM, METHOD section 2).
+    """13 x 13 changes of the displacement per decision (MotionLM, method.md section 2).
 
     A displacement is a whole number of bins along and across the agent's heading. The displacement of the last
     decision is read from ``recent``, turned into the current frame and rounded to bins; the token ``13 * i + j`` then

@@ -1,7 +1,7 @@
 """Signed distances between oriented boxes of the plane, with rounded corners.
 
 A *box* is ``(x, y, heading, length, width)``; the metric of the Waymo Open Sim Agents Challenge calls two road users in
-collision where the distance between their boxes, with corners rounded, is negative (SPEC section 3.1).
+collision where the distance between their boxes, with corners rounded, is negative (realism.md section 3.1).
 """
 
 from __future__ import annotations

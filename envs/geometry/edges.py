@@ -1,6 +1,6 @@
 """Signed distance from points and boxes to the road edges of a map.
 
-Distances follow the off-road measure of the Waymo Open Sim Agents Challenge (SPEC section 4.1): the nearest segment is
+Distances follow the off-road measure of the Waymo Open Sim Agents Challenge (realism.md 4.1): the nearest segment is
 chosen with height stretched by three, so that an edge on a bridge does not rule the road beneath it; what is reported
 is the distance in the plane, positive on the right of the edge, which is off the road.
 """

@@ -1,4 +1,4 @@
-"""Time until an agent reaches the one that it follows (SPEC section 3.2)."""
+"""Time until an agent reaches the one that it follows (realism.md section 3.2)."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 LEVEL_STRETCH = 3.0
-"""Weight of height in "nearest", so that a bridge is far from the road below it (SPEC section 4.1)."""
+"""Weight of height in "nearest", so that a bridge is far from the road below it (realism.md section 4.1)."""
 KNOT_STEPS = 5
 """Steps of 0.1 s between two looks at the map; heights between them are interpolated."""
 

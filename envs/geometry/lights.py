@@ -20,7 +20,7 @@ class Lanes:
         delta: ``[W, 2]`` [m].
         owner: ``[W]`` int64, ``feature_id`` of the lane.
         plus_for_minus: distances add the projection that they should subtract, as the code of the Waymo Open Sim
-            Agents Challenge does (SPEC section 4.2).
+            Agents Challenge does (realism.md section 4.2).
     """
 
     start: Tensor
@@ -40,7 +40,7 @@ class Lanes:
 
         Keyword Args:
             to_origin: lanes shorter than the longest one go on to the origin: the code of the challenge pads them with
-                zeros (SPEC section 4.2).
+                zeros (realism.md section 4.2).
             plus_for_minus: see the class.
 
         Examples:

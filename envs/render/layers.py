@@ -70,7 +70,7 @@ def pose_tracks(scene: Scene, trajectories: Tensor | None = None) -> Tensor:
 
     Args:
         scene: one uncollated scene.
-        trajectories: ``[A', T, 3]`` (x, y, heading) or ``[A', T, 4]`` (x, y, z, heading, the order of SPEC section 1.5)
+        trajectories: ``[A', T, 3]`` (x, y, heading) or ``[A', T, 4]`` (x, y, z, heading, the order of realism.md 1.5)
             of the A' agents present at the current step, in scene order, from the step after the current one; NaN where
             an agent is not there. None gives the log.
 

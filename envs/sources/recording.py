@@ -158,7 +158,7 @@ class Recording:
         predict: indices of the tracks to predict.
         polylines: the map.
         links: rows ``(feature_id, feature_id, LinkKind)``, in any order, repeated or not.
-        lights: listings in recorded order; of several for one lane and step the later one counts (SPEC section 4.2).
+        lights: listings in recorded order; of several for one lane and step the later one counts (realism.md 4.2).
         lacks: what the recording does not have.
     """
 

@@ -1,6 +1,6 @@
 """Message classes for the Scenario proto of the Waymo Open Motion Dataset.
 
-Field numbers are facts of the format (SPEC section 9). Fields that no scene keeps (lidar, camera, boundary segments of
+Field numbers are facts of the format (realism.md 9). Fields that no scene keeps (lidar, camera, boundary segments of
 lanes) are listed too, so that a field which is really unknown can be told from them.
 """
 

@@ -1,4 +1,4 @@
-"""TFRecord files: frames of ``length (u64), crc(length), payload, crc(payload)``, little endian (SPEC section 9)."""
+"""TFRecord files: frames of ``length (u64), crc(length), payload, crc(payload)``, little endian (realism.md 9)."""
 
 from __future__ import annotations
 

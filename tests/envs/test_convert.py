@@ -355,7 +355,7 @@ def test_two_workers_give_the_same_bytes_as_one(raw: Path, tmp_path: Path) -> No
 def test_real_files_convert(shared: Path, tmp_path: Path) -> None:
     store = convert("womd", [shared / "scenes/womd"], tmp_path / "womd")
     assert store.scene_ids == ["637f20cafde22ff8", "ee519cf571686d19"]
-    assert store.num_agents.tolist() == [50, 84]  # SPEC section 1.2
+    assert store.num_agents.tolist() == [50, 84]  # realism.md section 1.2
     lights = convert("gpudrive", [shared / "scenes/gpudrive/lights"], tmp_path / "lights", limit=2)
     assert lights.scene_ids == ["238786b3cccc4a0e", "48b0814dee9301a0"]
     argoverse = convert("argoverse", [shared / "scenes/argoverse2"], tmp_path / "argoverse")

@@ -18,7 +18,7 @@ from envs.signals import SignalMap
 
 @register("red_light", unit="1", clip=(0.0, 1.0), weight=10.0, spread=0.041, past=1)
 def red_light(motion: Motion) -> Tensor:
-    """1 at the step at which the agent passes the stop point of its lane while the light is red (SPEC section 4.2).
+    """1 at the step at which the agent passes the stop point of its lane while the light is red (realism.md 4.2).
 
     Nobody does where a scene has no lights or no surface streets.
     """
@@ -50,7 +50,7 @@ def heading_error(motion: Motion) -> Tensor:
 
 @register("time_to_collision", unit="s", clip=(0.0, LONGEST_TIME), weight=1.0, spread=0.55, past=1)
 def time_to_collision_(motion: Motion) -> Tensor:
-    """Time until the agent reaches its leader at present speeds, cut at 5 s (SPEC section 3.2).
+    """Time until the agent reaches its leader at present speeds, cut at 5 s (realism.md section 3.2).
 
     A leader whose log lacks the step before has no speed, and leads nobody.
     """

@@ -1,4 +1,4 @@
-"""Submission files of the Waymo Open Sim Agents Challenge (SPEC section 9), without TensorFlow.
+"""Submission files of the Waymo Open Sim Agents Challenge (realism.md section 9), without TensorFlow.
 
 :func:`encode_rollouts` and :func:`decode_rollouts` turn poses into messages and back, :class:`SubmissionWriter`
 makes the archive, :class:`SubmissionReader` goes through one, and :func:`validate` lists what is wrong with it.

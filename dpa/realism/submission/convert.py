@@ -16,7 +16,7 @@ _INT32 = torch.iinfo(torch.int32)
 
 
 def present_ids(scene: Scene) -> list[int]:
-    """Ids of the agents that a submission holds, in the order of poses (SPEC section 1.2).
+    """Ids of the agents that a submission holds, in the order of poses (realism.md section 1.2).
 
     Raises:
         SubmissionError: an id is not unique, or does not fit the format.

@@ -1,6 +1,6 @@
 """Message classes of a submission, and what they have in common.
 
-Field numbers are facts of the format (SPEC section 9). The fields from ``width`` to ``valid`` belong to the
+Field numbers are facts of the format (realism.md section 9). The fields from ``width`` to ``valid`` belong to the
 Scenario-Gen challenge; a Sim Agents submission leaves them unset.
 """
 

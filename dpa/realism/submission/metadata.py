@@ -1,4 +1,4 @@
-"""Who submits what: the metadata that every shard of a submission repeats (SPEC section 9)."""
+"""Who submits what: the metadata that every shard of a submission repeats (realism.md section 9)."""
 
 from __future__ import annotations
 

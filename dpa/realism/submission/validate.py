@@ -1,4 +1,4 @@
-"""What is wrong with a submission: all that the server refuses, and what breaks its metric (SPEC section 9).
+"""What is wrong with a submission: all that the server refuses, and what breaks its metric (realism.md section 9).
 
 The whole submission is gone through scenario by scenario, and every fault is listed. Where a file is damaged, that is
 its one fault: what cannot be read is not called missing.

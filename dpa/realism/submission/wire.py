@@ -13,7 +13,7 @@ from typing import BinaryIO, NamedTuple
 from dpa.realism.submission.messages import CorruptError
 
 MAX_SHARD_BYTES = 2_000_000_000
-"""A shard must be smaller (SPEC section 9)."""
+"""A shard must be smaller (realism.md section 9)."""
 SHARD_NAME = re.compile(r"[^/\\]*\.binproto(-(\d{5})-of-(\d{5}))?")
 """What a shard may be called; the groups are the suffix, its number and the number of shards."""
 ROLLOUTS_FIELD = 1

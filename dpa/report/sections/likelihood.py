@@ -1,4 +1,4 @@
-"""Likelihood that methods give to ranked rollouts: a table, and curves along training (METHOD figures 4 and 6)."""
+"""Likelihood that methods give to ranked rollouts: a table, and curves along training (figures 4 and 6)."""
 
 from __future__ import annotations
 

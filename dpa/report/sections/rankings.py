@@ -1,4 +1,4 @@
-"""Studies of rankings: a distance and realism (METHOD figure 3), its options, and a discriminator (figure 10)."""
+"""Studies of rankings: a distance and realism (figure 3 of the paper), its options, and a discriminator (figure 10)."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def sensitivity_section(found: Mapping[str, Any]) -> Section:
 
 
 def discriminator_section(found: Mapping[str, Any]) -> Section:
-    """What a discriminator of log and rollouts ranks by (METHOD figure 10).
+    """What a discriminator of log and rollouts ranks by (figure 10 of the paper).
 
     Args:
         found: ``discriminator/summary.json`` of a study.

@@ -1,4 +1,4 @@
-"""Scaling (METHOD figure 7): realism against what was scaled, and against the distance from the reference."""
+"""Scaling (figure 7 of the paper): realism against what was scaled, and against the distance from the reference."""
 
 from __future__ import annotations
 
