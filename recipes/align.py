@@ -9,7 +9,7 @@ Methods differ in one YAML each: dpa_omf, dpa_adef, sft_best_oa, sft_best_ade, a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import hydra
@@ -35,7 +35,7 @@ from recipes.rankings import open_preferences
 from recipes.scenes import fingerprint, open_splits
 from recipes.watch import Look, Watch
 
-OBSERVING = ("checkpoint_interval", "max_rows", "watch_interval", "watch_scenes", "watch_pairs")
+OBSERVING = ("checkpoint_interval", "max_rows", "snapshots", "watch_interval", "watch_scenes", "watch_pairs")
 """Options of the section ``alignment`` that change nothing about the policy."""
 
 
@@ -92,7 +92,9 @@ def align(
         "ranking": store.provenance.ranking,
         "expert": None if played is None else played.provenance.policy,
     }
+    snapshots = {step: folder / f"step_{step}" / "policy.pt" for step in options.snapshots if step <= options.steps}
     if ranks.agree(finished(result, decided_by) is not None and path.is_file(), "finished =", folder):
+        check_kept(snapshots)
         return path
     seed_everything(seed)
     candidates = make_candidates(method.data, store, scenes, context, model.tokenizer.cpu(), seed, played, learnt)
@@ -130,14 +132,29 @@ def align(
             done = step + 1
             if look is not None and (done % options.watch_interval == 0 or done == options.steps):
                 run.log(look(device))
-            if ranks.main and done in options.snapshots:
-                write_policy(folder / f"step_{done}" / "policy.pt", model, config, described | {"step": done})
+            if ranks.main and done in snapshots:
+                write_policy(snapshots[done], model, config, described | {"step": done})
+    check_kept(snapshots)
     if ranks.main:
         write_policy(path, model, config, described)
         last = {name: finite(curve["value"][-1]) for name, curve in read_curves(folder).items()}
         write_json(result, {"options": decided_by, "policy": str(path), "last_step": last})
     ranks.wait()
     return path
+
+
+def check_kept(snapshots: Mapping[int, Path]) -> None:
+    """Refuse to take a run for one that kept other snapshots: they cannot be had any more.
+
+    Raises:
+        ValueError: one is missing.
+    """
+    for step, path in snapshots.items():
+        if not path.is_file():
+            raise ValueError(
+                f"{path.parent.parent} was trained without a snapshot of step {step}, which alignment.snapshots asks "
+                "for; remove that folder to train it again, or leave the snapshot out."
+            )
 
 
 def check_enough(candidates: Candidates, pairs_per_scene: int) -> None:

@@ -111,8 +111,7 @@ def make_candidates(
         ValueError: an unknown kind, ranking or way to pair, more rollouts than the groups hold, no pair is left, or
             no store of an expert that fits.
     """
-    data = _counted(data, store.provenance.num_rollouts)
-    _check(data, store)
+    data = check_data(data, store.provenance.num_rollouts)
     if data.kind == "expert":
         expert = _check_expert(data, store, expert)
     contexts = Contexts(scenes, options)
@@ -188,13 +187,26 @@ def _choose_pairs(data: DictConfig, distance: Tensor, seed: int) -> list[Chosen]
             "distance; lower it."
         )
     if data.rankings_per_scene is not None:
-        if data.rankings_per_scene > preferred.shape[1]:
-            raise ValueError(
-                f"method.data.rankings_per_scene={data.rankings_per_scene} and a scene has {preferred.shape[1]} pairs; "
-                "lower it, take more of the rollouts (method.data.num), or collect more of them."
-            )
         kept = thin_out(kept, data.rankings_per_scene, make_generator(seed, "rankings"))
     return [Chosen(near[rows], far[rows]) for near, far, rows in zip(preferred, unpreferred, kept, strict=True)]
+
+
+def check_data(data: DictConfig, held: int) -> DictConfig:
+    """Refuse options of a method's data before any work.
+
+    Args:
+        data: of a method, see :func:`make_candidates`.
+        held: K, rollouts of a scene.
+
+    Returns:
+        The options, shares of the rollouts as whole numbers.
+
+    Raises:
+        ValueError: an unknown kind, ranking or way to pair, or more rollouts than there are.
+    """
+    data = _counted(data, held)
+    _check(data, held)
+    return data
 
 
 def _counted(data: DictConfig, held: int) -> DictConfig:
@@ -206,8 +218,7 @@ def _counted(data: DictConfig, held: int) -> DictConfig:
     return OmegaConf.merge(data, {name: max(1, round(share * held)) for name, share in shares.items()})
 
 
-def _check(data: DictConfig, store: PreferenceStore) -> None:
-    """Refuse options before any work."""
+def _check(data: DictConfig, held: int) -> None:
     if data.kind not in SIDES:
         raise ValueError(f"method.data.kind must be one of {', '.join(SIDES)}, got {data.kind!r}.")
     if data.kind in RANKED and data.rank_by not in (keys.DISTANCE, keys.ADE):
@@ -220,21 +231,32 @@ def _check(data: DictConfig, store: PreferenceStore) -> None:
                 f"method.data.pairs=all takes every pair, and method.data.num={data.num} asks for some; say "
                 "method.data.num=null, and rankings_per_scene to keep fewer."
             )
+        _check_rankings(data, held * (held - 1) // 2)
         return
     if data.kind == "ranking" and data.num is None:
         return
     for name in ("num", "num_unpreferred") if data.kind == "sets" else ("num",):
-        if not isinstance(data[name], int):
+        if not isinstance(data.get(name), int):
             raise ValueError(
-                f"method.data.{name} must be a whole number, or a share between 0 and 1, got {data[name]!r}."
+                f"method.data.{name} must be a whole number, or a share between 0 and 1, got {data.get(name)!r}."
             )
         if data[name] < 1:
             raise ValueError(f"method.data.{name} must be 1 or more, got {data[name]}.")
-    _check_enough(data, store)
+    _check_enough(data, held)
+    if data.kind == "pairs":
+        _check_rankings(data, data.num)
 
 
-def _check_enough(data: DictConfig, store: PreferenceStore) -> None:
-    held, asked, needed = store.provenance.num_rollouts, f"method.data.num={data.num}", data.num
+def _check_rankings(data: DictConfig, pairs: int) -> None:
+    if data.rankings_per_scene is not None and data.rankings_per_scene > pairs:
+        raise ValueError(
+            f"method.data.rankings_per_scene={data.rankings_per_scene} and a scene has {pairs} pairs; lower it, take "
+            "more of the rollouts (method.data.num), or collect more of them."
+        )
+
+
+def _check_enough(data: DictConfig, held: int) -> None:
+    asked, needed = f"method.data.num={data.num}", data.num
     if data.kind == "pairs":
         needed *= 2
     elif data.kind == "sets":
@@ -243,7 +265,7 @@ def _check_enough(data: DictConfig, store: PreferenceStore) -> None:
         raise ValueError(f"a ranking needs two rollouts, got {asked}; say 2 or more, or null for all.")
     if needed > held:
         raise ValueError(
-            f"{asked} needs {needed} rollouts of a scene and the store holds {held}; lower it, or collect again with a "
+            f"{asked} needs {needed} rollouts of a scene and there are {held}; lower it, or collect again with a "
             "larger collection.num_rollouts."
         )
 

@@ -7,17 +7,16 @@ from omegaconf import DictConfig, OmegaConf
 from dpa.policy import Decoding, MotionLM
 from dpa.ranking import PreferenceDistance
 from dpa.realism.config import RealismConfig
-from dpa.report.table import REFERENCE
+from dpa.report.experiment import REPORTED
 from dpa.tokens import VerletTokenizer
 from dpa.training.loggers import check_backend
+from recipes.candidates import check_data
 from recipes.cli import check_steps, told_of
 from recipes.losses import check_fit, make_loss
 from recipes.methods import read_setups
 from recipes.models import policy_config
 from recipes.rankings import build_distance
 
-SPLITS = ("tune", "eval")
-"""What an experiment can report."""
 CHECKPOINTS = ("last", "select", "all")
 """What becomes of the snapshots of an alignment: there are none, one of them may be chosen, or each is shown."""
 
@@ -72,6 +71,7 @@ def _check_methods(cfg: DictConfig) -> None:
     for name, setup in read_setups(cfg).items():
         with told_of(f"methods.{name}"):
             check_fit(cfg.methods[name])
+            check_data(cfg.methods[name].data, cfg.collection.num_rollouts)
             make_loss(cfg.methods[name].loss, model)
         unknown = sorted(set(setup.alignment) - set(cfg.alignment))
         if unknown:
@@ -80,14 +80,19 @@ def _check_methods(cfg: DictConfig) -> None:
 
 
 def _check_report(cfg: DictConfig) -> None:
-    experiment, setups = cfg.experiment, read_setups(cfg)
+    experiment = cfg.experiment
     if experiment.headline not in cfg.methods:
         raise ValueError(
             f"experiment.headline={experiment.headline} is no method of the experiment; name one of "
             f"{', '.join(cfg.methods)}."
         )
-    if experiment.split not in SPLITS:
-        raise ValueError(f"experiment.split must be one of {', '.join(SPLITS)}, got {experiment.split!r}.")
+    if experiment.versus not in (None, *cfg.methods):
+        raise ValueError(
+            f"experiment.versus={experiment.versus} is no method of the experiment; name one of "
+            f"{', '.join(cfg.methods)}, or null for the headline's."
+        )
+    if experiment.split not in REPORTED:
+        raise ValueError(f"experiment.split must be one of {', '.join(REPORTED)}, got {experiment.split!r}.")
     if experiment.checkpoints not in CHECKPOINTS:
         raise ValueError(
             f"experiment.checkpoints must be one of {', '.join(CHECKPOINTS)}, got {experiment.checkpoints!r}."
@@ -96,10 +101,4 @@ def _check_report(cfg: DictConfig) -> None:
         raise ValueError(
             f"experiment.checkpoints={experiment.checkpoints} needs checkpoints: say for example "
             f"alignment.snapshots=[{cfg.alignment.steps // 2}]."
-        )
-    further = [name for name, setup in setups.items() if setup.expert or setup.start != REFERENCE]
-    if experiment.checkpoints == "select" and further:
-        raise ValueError(
-            f"experiment.checkpoints=select chooses when all methods are trained, and {further[0]} needs another "
-            "method before; say checkpoints=last."
         )

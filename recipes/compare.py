@@ -12,7 +12,9 @@ can. Run the same command again to go on after a kill.
 from __future__ import annotations
 
 import sys
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from itertools import product
+from typing import Any
 
 import hydra
 from omegaconf import DictConfig
@@ -37,22 +39,10 @@ from recipes.pictures import write_players
 from recipes.pool import Workers
 from recipes.provenance import provenance
 from recipes.report import report
-from recipes.runs import SNAPSHOT
+from recipes.runs import SNAPSHOT, Run
 from recipes.scenes import open_splits
 from recipes.stages import Stages, alone_in
-from recipes.summary import summarise_experiment
-
-
-class Chosen(NamedTuple):
-    """What the tuning scenes decided.
-
-    Attributes:
-        policies: method -> the policy that stands for it: its last one, or a snapshot.
-        decodings: method -> its own best decoding.
-    """
-
-    policies: dict[str, str]
-    decodings: dict[str, Decoding]
+from recipes.summary import Chosen, summarise_experiment
 
 
 def compare(cfg: DictConfig) -> dict[str, Any]:
@@ -70,8 +60,8 @@ def compare(cfg: DictConfig) -> dict[str, Any]:
             chosen = choose(cfg, stages)
             measure(cfg, stages, chosen)
         if cfg.pictures.scenes:
-            write_players(cfg, splits[cfg.experiment.split], chosen.policies, chosen.decodings)
-        found = summarise_experiment(cfg, splits, chosen.policies, chosen.decodings, stages.seconds) | made
+            write_players(cfg, splits[cfg.experiment.split], chosen.best)
+        found = summarise_experiment(cfg, splits, chosen, stages.seconds) | made
         write_json(runs.experiment(cfg.experiment.name), found)
         log_experiment(cfg, found)
     return found
@@ -97,17 +87,16 @@ def choose(cfg: DictConfig, stages: Stages) -> Chosen:
     policies = {method: [method] for method in shown_policies(cfg)}
     if cfg.experiment.checkpoints == "select":
         policies |= {method: [*snapshots_of(cfg, method), method] for method in cfg.methods}
-    runs = {
-        method: [(policy, decoding) for policy in among for decoding in decodings(cfg)]
-        for method, among in policies.items()
-    }
-    wanted = {run for of_method in runs.values() for run in of_method}
-    jobs = sorted((seed, policy, "tune", *spec(decoding)) for policy, decoding in wanted for seed in cfg.seeds)
-    stages.run("tune", evaluate_job, cfg, jobs)
-    best = {method: max(among, key=lambda run: tuning_realism(cfg, *run)) for method, among in runs.items()}
+    runs = {method: [Run(*each) for each in product(among, decodings(cfg))] for method, among in policies.items()}
+    stages.run("tune", evaluate_job, cfg, jobs_of(cfg, {run for among in runs.values() for run in among}, "tune"))
+    common = Decoding(*cfg.decoding.common)
+
+    def best(among: Iterable[Run]) -> Run:
+        return max(among, key=lambda run: tuning_realism(cfg, run))
+
     return Chosen(
-        {method: policy for method, (policy, _) in best.items()},
-        {method: decoding for method, (_, decoding) in best.items()},
+        common={method: best(run for run in among if run.decoding == common) for method, among in runs.items()},
+        best={method: best(among) for method, among in runs.items()},
     )
 
 
@@ -117,14 +106,12 @@ def measure(cfg: DictConfig, stages: Stages, chosen: Chosen) -> None:
     The evaluation scenes are looked at once for each result. An experiment that looks for settings reports the tuning
     scenes, which have been rolled out for the choice of decodings.
     """
-    seeds, split, common = list(cfg.seeds), cfg.experiment.split, Decoding(*cfg.decoding.common)
-    wanted = {(policy, common) for policy in chosen.policies.values()}
-    wanted |= {(policy, chosen.decodings[method]) for method, policy in chosen.policies.items()}
-    wanted |= {(REFERENCE, each) for each in decodings(cfg)}
-    jobs = sorted((seed, policy, split, *spec(decoding)) for seed in seeds for policy, decoding in wanted)
-    stages.run("evaluate", evaluate_job, cfg, jobs)
-    policies = list(chosen.policies.values())
-    stages.run("likelihood", likelihood_job, cfg, [(seed, policy, split) for policy in policies for seed in seeds])
+    split, wanted = cfg.experiment.split, {*chosen.common.values(), *chosen.best.values()}
+    stages.run(
+        "evaluate", evaluate_job, cfg, jobs_of(cfg, wanted | {Run(REFERENCE, each) for each in decodings(cfg)}, split)
+    )
+    policies = dict.fromkeys(run.policy for run in [*chosen.best.values(), *chosen.common.values()])
+    stages.run("likelihood", likelihood_job, cfg, [(seed, policy, split) for policy in policies for seed in cfg.seeds])
 
 
 def shown_policies(cfg: DictConfig) -> list[str]:
@@ -146,14 +133,15 @@ def decodings(cfg: DictConfig) -> list[Decoding]:
     return [Decoding(*each) for each in cfg.decoding.grid]
 
 
-def spec(decoding: Decoding) -> tuple[float, float]:
-    """A decoding as a job's arguments."""
-    return decoding.top_p, decoding.temperature
+def jobs_of(cfg: DictConfig, runs: Iterable[Run], split: str) -> list[tuple[int, str, str, float, float]]:
+    """Arguments of :func:`~recipes.jobs.evaluate_job` for some runs and all seeds."""
+    each = ((run.policy, split, run.decoding.top_p, run.decoding.temperature) for run in runs)
+    return sorted((seed, *run) for run, seed in product(each, cfg.seeds))
 
 
-def tuning_realism(cfg: DictConfig, policy: str, decoding: Decoding) -> float:
+def tuning_realism(cfg: DictConfig, run: Run) -> float:
     """Sum over seeds of the mean realism on the tuning scenes."""
-    paths = [runs_of(cfg).evaluation(seed, policy, "tune", decoding) for seed in cfg.seeds]
+    paths = [runs_of(cfg).evaluation(seed, run, "tune") for seed in cfg.seeds]
     return sum(read_json(path)["mean"]["realism"] for path in paths)
 
 

@@ -26,7 +26,7 @@ from recipes.models import open_policy, weights_digest
 from recipes.pretrain import pretrain
 from recipes.rankings import TimedDistance, build_distance, open_ranked_scenes
 from recipes.rerank import rerank
-from recipes.runs import RunFolder
+from recipes.runs import Run, RunFolder
 from recipes.scenes import fingerprint, open_splits
 from recipes.watch import Watch
 
@@ -93,8 +93,8 @@ def evaluate_job(cfg: DictConfig, seed: int, policy: str, split: str, top_p: flo
     """One policy at one decoding, on the tuning or the evaluation scenes."""
     if split == "tune":
         cfg = OmegaConf.merge(cfg, {"evaluation": {"num_rollouts": cfg.decoding.num_rollouts}})
-    runs, scenes, decoding = runs_of(cfg), open_splits(cfg.scenes)[split], Decoding(top_p, temperature)
-    evaluate(cfg, scenes, runs.policy(seed, policy), decoding, seed, runs.evaluation(seed, policy, split, decoding))
+    runs, scenes, run = runs_of(cfg), open_splits(cfg.scenes)[split], Run(policy, Decoding(top_p, temperature))
+    evaluate(cfg, scenes, runs.policy(seed, policy), run.decoding, seed, runs.evaluation(seed, run, split))
 
 
 def likelihood_job(cfg: DictConfig, seed: int, policy: str, split: str) -> None:
@@ -121,7 +121,16 @@ def likelihood_job(cfg: DictConfig, seed: int, policy: str, split: str) -> None:
             f"{store.folder} holds {len(probes)} of {len(scenes)} scenes; run the same command again to fill it."
         )
     found = probe(model.to(cfg.device), reference.to(cfg.device), probes, cfg.device)
-    drift = divergence(model, reference, scenes, options, num_rollouts=cfg.drift_rollouts, seed=seed, device=cfg.device)
+    drift = divergence(
+        model,
+        reference,
+        scenes,
+        options,
+        num_rollouts=cfg.drift_rollouts,
+        seed=seed,
+        memory=cfg.evaluation.memory,
+        device=cfg.device,
+    )
     per_scene = {name: [finite(each[name]) for each in found] for name in PROBED} | {"kl": list(map(finite, drift))}
     mean = {name: mean_known(values) for name, values in per_scene.items()}
     write_json(path, {"options": decided_by, "mean": mean, "scenes": scenes.scene_ids, "per_scene": per_scene})

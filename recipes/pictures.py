@@ -7,7 +7,6 @@ from dataclasses import asdict
 
 from omegaconf import DictConfig
 
-from dpa.policy import Decoding
 from dpa.report.experiment import read_json
 from dpa.report.player import pack_players
 from envs.store import SceneStore
@@ -16,28 +15,26 @@ from recipes.jobs import runs_of
 from recipes.models import open_policy, weights_digest
 from recipes.play import roll_out
 from recipes.rankings import build_distance
+from recipes.runs import Run
 from recipes.scenes import fingerprint
 from recipes.summary import labels
 
 
-def write_players(
-    cfg: DictConfig, scenes: SceneStore, policies: Mapping[str, str], decodings: Mapping[str, Decoding]
-) -> None:
+def write_players(cfg: DictConfig, scenes: SceneStore, chosen: Mapping[str, Run]) -> None:
     """Roll the policies of the first seed out in some scenes, each at its own best decoding, and keep what is shown.
 
     Args:
         cfg: of the experiment; ``pictures`` names the number of scenes, rollouts and those kept.
-        scenes: of the reported split; the first ones are shown.
-        policies: method -> the policy that stands for it.
-        decodings: of each method.
+        scenes: of the reported split; neighbours may be of one place, so those shown lie evenly among them.
+        chosen: what stands for each method.
     """
     runs, seed, options = runs_of(cfg), cfg.seeds[0], cfg.pictures
-    files = {method: runs.policy(seed, policy) for method, policy in policies.items()}
-    named = labels(cfg, policies)
+    files = {method: runs.policy(seed, run.policy) for method, run in chosen.items()}
+    named = labels(cfg, chosen)
     distance = build_distance(cfg.collection.ranking, "collection.ranking")
     decided_by = {
         "policies": {method: weights_digest(open_policy(path)[0]) for method, path in files.items()},
-        "decodings": {method: asdict(decodings[method]) for method in files},
+        "decodings": {method: asdict(run.decoding) for method, run in chosen.items()},
         "scenes": fingerprint(scenes),
         "labels": named,
         "ranking": distance.describe(),
@@ -49,8 +46,8 @@ def write_players(
     players = roll_out(
         {named[method]: path for method, path in files.items()},
         scenes,
-        range(min(options.scenes, len(scenes))),
-        decoding={named[method]: decodings[method] for method in files},
+        range(0, len(scenes), max(1, len(scenes) // options.scenes))[: options.scenes],
+        decoding={named[method]: run.decoding for method, run in chosen.items()},
         num_rollouts=options.num_rollouts,
         kept=options.kept,
         distance=distance,

@@ -4,12 +4,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from dpa.policy import Decoding
 from dpa.report.table import REFERENCE
 
 SNAPSHOT = "@"
 """Between a method and a step: ``dpa_omf@60`` is what DPA-OMF was after 60 steps."""
+
+
+class Run(NamedTuple):
+    """What is rolled out.
+
+    Attributes:
+        policy: a method, or one of its snapshots.
+        decoding: how its tokens are drawn.
+    """
+
+    policy: str
+    decoding: Decoding
 
 
 @dataclass(frozen=True)
@@ -23,7 +36,7 @@ class RunFolder:
         >>> runs = RunFolder(Path("runs/real"))
         >>> runs.policy(0, "dpa_omf@60").as_posix()
         'runs/real/seed_0/dpa_omf/step_60/policy.pt'
-        >>> runs.evaluation(0, "reference", "eval", Decoding(0.9, 0.8)).as_posix()
+        >>> runs.evaluation(0, Run("reference", Decoding(0.9, 0.8)), "eval").as_posix()
         'runs/real/seed_0/reference/eval_top_p_0.9_t_0.8.json'
         >>> runs.preferences(0, "train", "dpa_omf", "collision").name
         'preferences_train_of_dpa_omf_by_collision'
@@ -47,10 +60,10 @@ class RunFolder:
         by = "" if ranking is None else f"_by_{ranking}"
         return self.root / f"seed_{seed}" / f"preferences_{split}{of}{by}"
 
-    def evaluation(self, seed: int, policy: str, split: str, decoding: Decoding) -> Path:
+    def evaluation(self, seed: int, run: Run, split: str) -> Path:
         """Figures of one policy at one decoding."""
-        name = f"{split}_top_p_{decoding.top_p:g}_t_{decoding.temperature:g}.json"
-        return self.training(seed, policy) / name
+        name = f"{split}_top_p_{run.decoding.top_p:g}_t_{run.decoding.temperature:g}.json"
+        return self.training(seed, run.policy) / name
 
     def likelihood(self, seed: int, policy: str, split: str) -> Path:
         """How likely logs and ranked rollouts are under one policy."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import compress
+from typing import Any, NamedTuple
 
 from omegaconf import DictConfig
 
@@ -13,17 +14,31 @@ from dpa.report.statistics import compare_methods
 from dpa.report.table import REFERENCE
 from recipes.candidates import SIDES
 from recipes.cli import plain
-from recipes.evaluate import SCENE_FIGURES
+from recipes.evaluate import SCENE_FIGURES, mean_known
 from recipes.jobs import runs_of
 from recipes.likelihoods import PROBED
 from recipes.methods import setup_of
-from recipes.runs import SNAPSHOT, method_of
+from recipes.runs import SNAPSHOT, Run, method_of
 from recipes.scenes import Splits
 
 TOLD = ("name", "title", "paper", "question", "headline", "axis", "split", "published")
 """What an experiment says of itself."""
-Run = tuple[str, Decoding]
-"""A method at a decoding."""
+
+
+class Chosen(NamedTuple):
+    """What the tuning scenes decided.
+
+    Attributes:
+        common: method -> its last policy or a snapshot, the best one at the common decoding.
+        best: method -> the best policy and decoding.
+    """
+
+    common: dict[str, Run]
+    best: dict[str, Run]
+
+
+Shown = tuple[str, Run]
+"""A row: a method and what stands for it."""
 
 
 class Results:
@@ -31,85 +46,74 @@ class Results:
 
     Args:
         cfg: of the experiment.
-        policies: method -> the policy that stands for it.
+        shown: all rows of the reported scenes. Those scenes are left out of every row for which one has no realism.
     """
 
-    def __init__(self, cfg: DictConfig, policies: Mapping[str, str]) -> None:
-        self.runs, self.policies, self.seeds = runs_of(cfg), policies, list(cfg.seeds)
-        self.split = cfg.experiment.split
+    def __init__(self, cfg: DictConfig, shown: Sequence[Shown]) -> None:
+        self.runs, self.seeds, self.split = runs_of(cfg), list(cfg.seeds), cfg.experiment.split
+        scores = [self._scores(run, seed) for _, run in shown for seed in self.seeds]
+        self.known = [all(score is not None for score in scene) for scene in zip(*scores, strict=True)]
 
-    def row(self, method: str, decoding: Decoding, seed: int, split: str) -> dict[str, Any]:
-        """Means of one run, and the file with the values of every scene."""
-        path = self.runs.evaluation(seed, self.policies[method], split, decoding)
-        found = read_json(path)
-        return {
-            "method": method,
-            "seed": seed,
-            "top_p": decoding.top_p,
-            "temperature": decoding.temperature,
-            "file": self.runs.relative(path),
-            "n_scenes": len(found["scenes"]),
-            **{name: found["mean"][name] for name in SCENE_FIGURES},
-        }
+    def rows(self, shown: Sequence[Shown]) -> list[dict[str, Any]]:
+        """Means of several runs over the reported scenes, each for all seeds, with the file behind each."""
+        return [self._row(method, run, seed, self.split) for method, run in shown for seed in self.seeds]
 
-    def rows(self, chosen: list[Run], split: str) -> list[dict[str, Any]]:
-        """Of several runs, each for all seeds."""
-        return [self.row(method, decoding, seed, split) for method, decoding in chosen for seed in self.seeds]
+    def tuning(self, shown: Sequence[Shown]) -> list[dict[str, Any]]:
+        """The same over all tuning scenes."""
+        return [self._row(method, run, seed, "tune") for method, run in shown for seed in self.seeds]
 
-    def likelihood(self, method: str, seed: int) -> dict[str, Any]:
+    def likelihood(self, method: str, policy: str, seed: int) -> dict[str, Any]:
         """What a policy thinks of logs and rollouts of the reported scenes."""
-        path = self.runs.likelihood(seed, self.policies[method], self.split)
+        path = self.runs.likelihood(seed, policy, self.split)
         mean = read_json(path)["mean"]
-        return {
-            "method": method,
-            "seed": seed,
-            "file": self.runs.relative(path),
-            **{name: mean[name] for name in (*PROBED, "kl")},
-        }
+        named = {"method": method, "seed": seed, "file": self.runs.relative(path)}
+        return named | {name: mean[name] for name in (*PROBED, "kl")}
 
-    def paired(self, chosen: list[Run], reference: Run) -> list[dict[str, Any]]:
+    def paired(self, shown: Sequence[Shown], reference: Shown) -> list[dict[str, Any]]:
         """Realism of each run minus that of a reference, by scene and seed, with intervals."""
-        if not chosen:
+        if not shown:
             return []
         scores = {
-            str(number): {str(seed): self._realism(*run, seed) for seed in self.seeds}
-            for number, run in enumerate([reference, *chosen])
+            str(number): {str(seed): self._known(self._scores(run, seed)) for seed in self.seeds}
+            for number, (_, run) in enumerate([reference, *shown])
         }
+        against = reference[1].decoding
         return [
             entry
             | {
                 "method": method,
-                "top_p": decoding.top_p,
-                "temperature": decoding.temperature,
+                "top_p": run.decoding.top_p,
+                "temperature": run.decoding.temperature,
                 "against": reference[0],
-                "against_top_p": reference[1].top_p,
-                "against_temperature": reference[1].temperature,
+                "against_top_p": against.top_p,
+                "against_temperature": against.temperature,
             }
-            for (method, decoding), entry in zip(chosen, compare_methods(scores, "0"), strict=True)
+            for (method, run), entry in zip(shown, compare_methods(scores, "0"), strict=True)
         ]
 
-    def leave_out(self, chosen: list[Run]) -> int:
-        """Leave the scenes out for which some run has no realism, here and from now on; gives their number."""
-        runs = [self._scores(*run, seed) for run in chosen for seed in self.seeds]
-        self.known = [all(score is not None for score in scene) for scene in zip(*runs, strict=True)]
-        return self.known.count(False)
+    def _row(self, method: str, run: Run, seed: int, split: str) -> dict[str, Any]:
+        path = self.runs.evaluation(seed, run, split)
+        found = read_json(path)["per_scene"]
+        values = {name: self._known(found[name]) if split == self.split else found[name] for name in SCENE_FIGURES}
+        return {
+            "method": method,
+            "seed": seed,
+            "top_p": run.decoding.top_p,
+            "temperature": run.decoding.temperature,
+            "file": self.runs.relative(path),
+            "n_scenes": len(values["realism"]),
+            **{name: mean_known(of_scenes) for name, of_scenes in values.items()},
+        }
 
-    def _realism(self, method: str, decoding: Decoding, seed: int) -> list[float]:
-        scores = self._scores(method, decoding, seed)
-        return [score for score, known in zip(scores, self.known, strict=True) if known]
+    def _known(self, values: Sequence[float | None]) -> list[float | None]:
+        return list(compress(values, self.known))
 
-    def _scores(self, method: str, decoding: Decoding, seed: int) -> list[float | None]:
-        return read_json(self.runs.evaluation(seed, self.policies[method], self.split, decoding))["per_scene"][
-            "realism"
-        ]
+    def _scores(self, run: Run, seed: int) -> list[float | None]:
+        return read_json(self.runs.evaluation(seed, run, self.split))["per_scene"]["realism"]
 
 
 def summarise_experiment(
-    cfg: DictConfig,
-    splits: Splits,
-    policies: Mapping[str, str],
-    own: Mapping[str, Decoding],
-    stages: Mapping[str, float],
+    cfg: DictConfig, splits: Splits, chosen: Chosen, stages: Mapping[str, float]
 ) -> dict[str, Any]:
     """The content of ``experiments/<name>.json``.
 
@@ -120,77 +124,93 @@ def summarise_experiment(
     Args:
         cfg: of the experiment.
         splits: scenes.
-        policies: method -> the policy that stands for it, the reference first.
-        own: method -> its own best decoding.
+        chosen: what stands for each method, the reference first.
         stages: worker-seconds of each stage.
     """
-    results, experiment = Results(cfg, policies), plain(cfg.experiment)
+    experiment, methods = plain(cfg.experiment), list(chosen.best)
     common, grid = Decoding(*cfg.decoding.common), [Decoding(*each) for each in cfg.decoding.grid]
-    at_common = [(method, common) for method in policies]
-    others = [(REFERENCE, each) for each in grid if each != common]
-    at_best = [(method, own[method]) for method in policies]
-    headline = (experiment["headline"], own[experiment["headline"]])
-    rivals = [run for run in at_best if run[0] not in (REFERENCE, headline[0])]
-    likelihood = [results.likelihood(method, seed) for method in policies for seed in cfg.seeds]
-    accuracy = {(entry["method"], entry["seed"]): entry["pair_accuracy"] for entry in likelihood}
-    left_out = results.leave_out(list(dict.fromkeys([*at_common, *others, *at_best])))
+    at_common, at_best = list(chosen.common.items()), list(chosen.best.items())
+    others = [(REFERENCE, Run(REFERENCE, each)) for each in grid if each != common]
+    results = Results(cfg, [*at_common, *others, *at_best])
+    standard = experiment["versus"] or experiment["headline"]
+    rivals = [run for run in at_best if run[0] not in (REFERENCE, standard)]
+    accuracy = {
+        (run.policy, seed): results.likelihood(method, run.policy, seed)["pair_accuracy"]
+        for method, run in [*at_common, *at_best]
+        for seed in cfg.seeds
+    }
 
-    def rows(chosen: list[Run]) -> list[dict[str, Any]]:
-        found = results.rows(chosen, experiment["split"])
-        return [row | {"pair_accuracy": accuracy[row["method"], row["seed"]]} for row in found]
+    def rows(shown: list[Shown]) -> list[dict[str, Any]]:
+        policies = [run.policy for _, run in shown for _ in cfg.seeds]
+        found = zip(results.rows(shown), policies, strict=True)
+        return [row | {"pair_accuracy": accuracy[policy, row["seed"]]} for row, policy in found]
 
     return {name: experiment[name] for name in TOLD} | {
+        "versus": standard,
         "metric": str(cfg.evaluation.metric),
         "scenes": {**splits.sizes(), "source": cfg.scenes.source},
         "seeds": list(cfg.seeds),
-        "methods": list(policies),
-        "labels": labels(cfg, policies),
-        "policies": dict(policies),
+        "methods": methods,
+        "labels": labels(cfg, methods),
+        "steps": {
+            "common": {method: steps_of(cfg, run.policy) for method, run in at_common},
+            "own_best": {method: steps_of(cfg, run.policy) for method, run in at_best},
+        },
         "common": [common.top_p, common.temperature],
-        "chosen": {method: [decoding.top_p, decoding.temperature] for method, decoding in own.items()},
-        "left_out": left_out,
+        "chosen": {method: [run.decoding.top_p, run.decoding.temperature] for method, run in at_best},
+        "left_out": results.known.count(False),
         "rows": rows(at_common + others),
         "paired": results.paired(at_common[1:] + others, at_common[0]),
         "own_best": {
             "rows": rows(at_best),
             "paired": results.paired(at_best[1:], at_best[0]),
-            "versus": results.paired(rivals, headline),
+            "versus": results.paired(rivals, (standard, chosen.best[standard])),
         },
-        "tuning": results.rows([(method, each) for method in policies for each in grid], "tune"),
-        "likelihood": likelihood,
+        "tuning": results.tuning([(method, run._replace(decoding=each)) for method, run in at_best for each in grid]),
+        "likelihood": [results.likelihood(method, run.policy, seed) for method, run in at_best for seed in cfg.seeds],
         "curves": {
             method: {str(seed): results.runs.relative(results.runs.training(seed, method)) for seed in cfg.seeds}
             for method in cfg.methods
         },
-        "budget": {method: budget(cfg, method) for method in cfg.methods},
+        "budget": {method: budget(cfg, chosen.best[method].policy) for method in cfg.methods},
         "stages": dict(stages),
         "worker_seconds": sum(stages.values()),
         "config": plain(cfg),
     }
 
 
-def budget(cfg: DictConfig, method: str) -> dict[str, Any]:
-    """What one training run of a method takes in, with the runs that it goes on from.
+def budget(cfg: DictConfig, policy: str) -> dict[str, Any]:
+    """What one training run takes in, with the runs that it goes on from and the expert that it learns from.
 
     Args:
         cfg: of the experiment.
-        method: its name.
+        policy: a method, or a snapshot of it: then up to there.
 
     Returns:
         ``steps``, ``rollouts`` (read in these steps) and ``start``.
     """
+    method = method_of(policy)
     setup, data = setup_of(cfg, method), cfg.methods[method].data
-    options = setup.merged(cfg.alignment)
+    options, steps = setup.merged(cfg.alignment), steps_of(cfg, policy)
     sides = 1 if SIDES[data.kind] == "targets" else 2
-    before = {"steps": 0, "rollouts": 0} if setup.start == REFERENCE else budget(cfg, setup.start)
+    before = [budget(cfg, name) for name in (setup.start, setup.expert) if name not in (None, REFERENCE)]
+    read = steps * options.scenes_per_step * options.pairs_per_scene * sides
     return {
-        "steps": before["steps"] + options.steps,
-        "rollouts": before["rollouts"] + options.steps * options.scenes_per_step * options.pairs_per_scene * sides,
+        "steps": steps + sum(each["steps"] for each in before),
+        "rollouts": read + sum(each["rollouts"] for each in before),
         "start": setup.start,
     }
 
 
-def labels(cfg: DictConfig, policies: Mapping[str, str]) -> dict[str, str]:
+def steps_of(cfg: DictConfig, policy: str) -> int:
+    """Steps of alignment behind a policy; those of what it started from are not counted."""
+    method, _, step = policy.partition(SNAPSHOT)
+    if method == REFERENCE:
+        return 0
+    return int(step) if step else setup_of(cfg, method).merged(cfg.alignment).steps
+
+
+def labels(cfg: DictConfig, policies: Iterable[str]) -> dict[str, str]:
     """How tables call methods; a snapshot is called by its step."""
     given = plain(cfg.experiment.labels)
     named = {policy: given.get(method_of(policy), method_of(policy)) for policy in policies}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -35,12 +35,14 @@ class Comparison:
     Attributes:
         rows: one for each method, decoding and seed; see :data:`ROW`.
         paired: realism of a method minus that of the reference, scene by scene; see :data:`PAIRED`.
-        versus: realism of a method minus that of the headline's, likewise.
+        versus: realism of a method minus that of the experiment's ``versus``, likewise.
+        steps: of alignment behind the policy that stands for each method, 0 for the reference.
     """
 
     rows: Sequence[Mapping[str, Any]]
     paired: Sequence[Mapping[str, Any]]
     versus: Sequence[Mapping[str, Any]] = ()
+    steps: Mapping[str, int] = field(default_factory=dict)
 
     def records(self) -> list[dict[str, Any]]:
         """One record for each method and decoding: means over seeds; see :func:`~dpa.report.table.summarise`."""
@@ -94,10 +96,11 @@ class Experiment:
         labels: what the methods are called.
         published: the paper's figures of a method, where it has some.
         headline: method whose difference is the result; fixed before the numbers are known.
+        versus: method that the others are compared with as well as with the reference.
         common: decoding of ``at_common``.
         chosen: each method's best decoding on the tuning scenes.
         at_common: all methods at the common decoding, the reference also at the others of the grid.
-        own_best: each method at its chosen decoding, against the reference and the headline's method at their own.
+        own_best: each method at its chosen decoding, against the reference and ``versus`` at their own.
         tuning: rows of every method at every decoding of the grid, on the tuning scenes.
         likelihood: rows ``{"method", "seed", "file"}`` and figures of likelihood, on the reported scenes.
         axis: of a scaling experiment.
@@ -128,6 +131,7 @@ class Experiment:
     labels: Mapping[str, str]
     published: Mapping[str, Mapping[str, float]]
     headline: str
+    versus: str
     common: Decoding
     chosen: Mapping[str, Decoding]
     at_common: Comparison
@@ -219,6 +223,7 @@ def read_experiment(path: str | Path) -> Experiment:
     kinds: dict[str, Any] = {
         "name": str, "title": str, "paper": (str, NONE), "question": str, "metric": str, "scenes": dict, "split": str,
         "left_out": int, "seeds": list, "methods": list, "labels": dict, "published": dict, "headline": str,
+        "versus": str, "steps": dict,
         "common": list, "chosen": dict, "rows": list, "paired": list, "own_best": dict, "tuning": list,
         "likelihood": list, "axis": (dict, NONE), "curves": dict, "budget": dict, "stages": dict,
         "worker_seconds": NUMBER, "config": dict, "revision": (str, NONE), "versions": dict, "machine": str,
@@ -226,6 +231,7 @@ def read_experiment(path: str | Path) -> Experiment:
     }  # fmt: skip
     _check(content, kinds, str(path))
     _check(content["own_best"], {"rows": list, "paired": list, "versus": list}, f"{path}: own_best")
+    _check(content["steps"], {"common": dict, "own_best": dict}, f"{path}: steps")
     _check(content["scenes"], {**dict.fromkeys(SPLITS, int), "source": str}, f"{path}: scenes")
     for method, budget in content["budget"].items():
         _check(budget, BUDGET, f"{path}: budget.{method}")
@@ -237,14 +243,15 @@ def read_experiment(path: str | Path) -> Experiment:
     for method, decoding in [("common", content["common"]), *content["chosen"].items()]:
         if len(decoding) != 2 or not all(isinstance(part, NUMBER) for part in decoding):
             raise ValueError(f"{path}: the decoding of {method} must be [top_p, temperature], got {decoding!r}.")
-    made = {key: content[key] for key in kinds if key not in ("rows", "paired", "common", "chosen", "own_best", "axis")}
+    read_below = {"rows", "paired", "common", "chosen", "own_best", "axis", "steps"}
+    made = {key: content[key] for key in kinds.keys() - read_below}
     own = content["own_best"]
     return Experiment(
         path=path,
         common=_decoding(content["common"]),
         chosen={method: _decoding(decoding) for method, decoding in content["chosen"].items()},
-        at_common=Comparison(content["rows"], content["paired"]),
-        own_best=Comparison(own["rows"], own["paired"], own["versus"]),
+        at_common=Comparison(content["rows"], content["paired"], steps=content["steps"]["common"]),
+        own_best=Comparison(own["rows"], own["paired"], own["versus"], content["steps"]["own_best"]),
         axis=None if axis is None else Axis(**axis),
         **made,
     )
@@ -252,13 +259,16 @@ def read_experiment(path: str | Path) -> Experiment:
 
 def _check_names(content: Mapping[str, Any], path: Path) -> None:
     """What is named exists."""
-    methods, headline = content["methods"], content["headline"]
+    methods, headline, versus = (content[name] for name in ("methods", "headline", "versus"))
     if content["split"] not in REPORTED:
         raise ValueError(f"{path}: split must be one of {', '.join(REPORTED)}, got {content['split']!r}.")
-    if headline not in methods or REFERENCE not in methods:
+    if not {REFERENCE, headline, versus} <= set(methods):
         raise ValueError(
-            f"{path}: methods must hold {REFERENCE!r} and the headline {headline!r}, got {', '.join(methods)}."
+            f"{path}: methods must hold {REFERENCE!r}, the headline {headline!r} and versus {versus!r}, got "
+            f"{', '.join(methods)}."
         )
+    for at, steps in content["steps"].items():
+        _check(steps, dict.fromkeys(methods, int), f"{path}: steps.{at}")
     for method, label in content["labels"].items():
         if not isinstance(label, str):
             raise ValueError(f"{path}: labels.{method} must be str, got {label!r}; put it in quotes.")
@@ -276,7 +286,7 @@ def _check_lists(content: Mapping[str, Any], path: Path) -> None:
         ("paired", content["paired"], PAIRED), ("own_best.paired", own["paired"], PAIRED),
         ("own_best.versus", own["versus"], PAIRED), ("likelihood", content["likelihood"], LIKELIHOOD),
     )  # fmt: skip
-    against = {"paired": REFERENCE, "own_best.paired": REFERENCE, "own_best.versus": content["headline"]}
+    against = {"paired": REFERENCE, "own_best.paired": REFERENCE, "own_best.versus": content["versus"]}
     for name, entries, kinds in lists:
         for place, entry in enumerate(entries):
             where = f"{path}: {name}[{place}]"

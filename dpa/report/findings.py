@@ -91,16 +91,16 @@ def left_out(experiment: Experiment) -> str | None:
 
 
 def budgets(experiment: Experiment) -> str | None:
-    """Which methods train on more or less than the headline's does; None where none does.
+    """Which methods train on more or less than the one they are compared with; None where none does.
 
     Examples:
         >>> import types
         >>> budget = {"dpa_omf": {"steps": 60, "rollouts": 960}, "round 2": {"steps": 120, "rollouts": 1920}}
         >>> labels = {"dpa_omf": "DPA-OMF", "round 2": "round 2"}
-        >>> budgets(types.SimpleNamespace(budget=budget, labels=labels, headline="dpa_omf"))
+        >>> budgets(types.SimpleNamespace(budget=budget, labels=labels, versus="dpa_omf"))
         'Budgets differ. Over that of DPA-OMF, round 2: 2 times the steps, 2 times the rollouts.'
     """
-    base = experiment.headline.partition("@")[0]
+    base = experiment.versus.partition("@")[0]
     if base not in experiment.budget:
         return None
     mine = {kind: of_base for kind in ("steps", "rollouts") if (of_base := experiment.budget[base][kind])}
@@ -117,7 +117,7 @@ def budgets(experiment: Experiment) -> str | None:
 
 
 def ordering(experiment: Experiment) -> str:
-    """Which methods can be told apart from the headline's, each at its own best decoding."""
+    """Which methods can be told apart from ``experiment.versus``, each at its own best decoding."""
     sides: dict[str, list[str]] = {"better": [], "worse": [], "not told apart": []}
     for entry in experiment.own_best.versus:
         low, high = entry["ci95"]

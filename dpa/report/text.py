@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 from dpa.report.experiment import Comparison, Experiment
 from dpa.report.findings import budgets, chosen_on_the_same, headline, left_out, ordering
 from dpa.report.sections.likelihood import DIGITS, FIGURES
 from dpa.report.study import Study
-from dpa.report.table import MISSING, cells, difference, duration, header, number, summarise, to_markdown
+from dpa.report.table import COLUMNS, MISSING, cells, difference, duration, header, number, summarise, to_markdown
 
 
 def study_text(study: Study) -> str:
@@ -35,7 +35,7 @@ def _experiment(experiment: Experiment) -> Iterator[str]:
     yield f"**Each at its own best decoding**, chosen on the {experiment.scenes['tune']} tuning scenes:"
     yield comparison_table(experiment, experiment.own_best)
     if told := ordering(experiment):
-        yield f"Against {experiment.labels[experiment.headline]}, {told}."
+        yield f"Against {experiment.labels[experiment.versus]}, {told}."
     if remarks := [
         told for told in (budgets(experiment), chosen_on_the_same(experiment), left_out(experiment)) if told
     ]:
@@ -48,7 +48,7 @@ def _experiment(experiment: Experiment) -> Iterator[str]:
 
 
 def comparison_table(experiment: Experiment, comparison: Comparison) -> str:
-    """The results table of an experiment, with differences to the reference and to the headline's method.
+    """The results table of an experiment, with differences to the reference and to ``experiment.versus``.
 
     Args:
         experiment: that it is of.
@@ -56,19 +56,27 @@ def comparison_table(experiment: Experiment, comparison: Comparison) -> str:
     """
     records = comparison.records()
     titles, rows = header(records), cells(records)
+    titles.insert(1, "steps")
     for record, row in zip(records, rows, strict=True):
-        row[0] = experiment.labels[record["method"]]
+        row[:1] = [experiment.labels[record["method"]], str(comparison.steps[record["method"]] or MISSING)]
     against = {entry["method"]: entry for entry in comparison.versus}
     if against:
-        titles.append(f"Δ to {experiment.labels[experiment.headline]}")
+        titles.append(f"Δ to {experiment.labels[experiment.versus]}")
         for record, row in zip(records, rows, strict=True):
             entry = against.get(record["method"], {})
             row.append(difference(entry.get("realism_difference"), entry.get("ci95")))
-    if experiment.published:
-        titles.append("paper")
-        for record, row in zip(records, rows, strict=True):
-            row.append(number(experiment.published.get(record["method"], {}).get("realism"), 3))
-    return to_markdown(titles, rows)
+    return to_markdown(titles, [*rows, *_published(experiment, titles)])
+
+
+def _published(experiment: Experiment, titles: Sequence[str]) -> Iterator[list[str]]:
+    """The paper's own numbers, in the columns that it has."""
+    columns = {f"{column.title} {column.better}": column for column in COLUMNS}
+    for method, figures in experiment.published.items():
+        cells = (
+            number(figures.get(columns[title].key), columns[title].digits) if title in columns else MISSING
+            for title in titles[1:]
+        )
+        yield [f"*paper: {experiment.labels[method]}*", *cells]
 
 
 def likelihood_table(experiment: Experiment) -> str:

@@ -19,7 +19,9 @@ from recipes.compare import choose, snapshots_of
 from recipes.jobs import runs_of
 from recipes.methods import read_setups
 from recipes.pool import Workers
+from recipes.runs import Run
 from recipes.stages import Stages, alone_in, read_account
+from recipes.summary import budget
 
 EXPERIMENTS = sorted(path.stem for path in (Path(CONFIG["config_path"]) / "experiment").glob("*.yaml"))
 FURTHER = "+experiment.setup.dpa_omf={start:dpa_adef}"
@@ -57,9 +59,12 @@ def test_a_method_comes_after_those_that_it_starts_from_or_learns_from() -> None
         (("+experiment.setup.dpa_omf={ranking:nothing}",), "ranking='nothing' is not among rankings"),
         (("+experiment.setup.dpa_omf={begin:dpa_adef}",), "experiment.setup.dpa_omf has no option 'begin'"),
         (("+methods.reference=${methods.dpa_omf}",), "methods.reference: .* are taken"),
-        (("experiment.split=train",), "experiment.split must be one of tune, eval, got 'train'"),
+        (("experiment.split=train",), "experiment.split must be one of eval, tune, got 'train'"),
         (("experiment.checkpoints=best",), "experiment.checkpoints must be one of last, select, all, got 'best'"),
-        (("experiment.checkpoints=all",), r"needs checkpoints: say for example alignment.snapshots=\[75\]"),
+        (
+            ("experiment.checkpoints=all", "alignment.snapshots=[]"),
+            r"needs checkpoints: say for example alignment.snapshots=\[75\]",
+        ),
         (("decoding.common=[0.5,1.0]",), r"decoding.common=\[0.5, 1.0\] must be one of decoding.grid"),
         (("decoding.grid=[0.95,0.85]",), r"decoding.grid takes pairs \[top-p, temperature\], got 0.95"),
         (("decoding.grid=[[0.95,1.0],[1.5,1.0]]",), r"top_p must lie in \(0, 1\], got 1.5"),
@@ -78,7 +83,12 @@ def test_a_method_comes_after_those_that_it_starts_from_or_learns_from() -> None
         (("+experiment.setup.dpa_omf={length:0}",), "experiment.setup.dpa_omf.length must be positive, got 0"),
         (("+experiment.setup.dpa_omf={expert:dpa_adef}",), "is for methods.dpa_omf.data.kind=expert, which is pairs"),
         (("ranking@collection.ranking=displacement",), "couples nothing; say pictures.scenes=0"),
-        (("experiment=rounds", "experiment.checkpoints=select", "alignment.snapshots=[40]"), "needs another method"),
+        (("experiment.versus=cpl",), "experiment.versus=cpl is no method of the experiment; name one of dpa_omf"),
+        (
+            ("experiment=scaling", "collection.num_rollouts=16"),
+            r"methods\.omf_r8: method\.data\.rankings_per_scene=8 and a scene has 4 pairs",
+        ),
+        (("methods.dpa_omf.data.kind=pair",), r"methods\.dpa_omf: method\.data\.kind must be one of"),
     ],
 )
 def test_an_experiment_that_cannot_work_is_refused_before_any_work(options: tuple[str, ...], message: str) -> None:
@@ -114,9 +124,7 @@ def test_snapshots_end_before_the_last_step_of_their_method() -> None:
 
 def test_checkpoint_and_decoding_are_chosen_together_by_the_mean_over_seeds(tmp_path: Path) -> None:
     grid = "decoding.grid=[[1.0,1.0],[0.95,1.0]]"
-    cfg = configuration(
-        f"output={tmp_path}", "seeds=[0,1]", grid, "experiment.checkpoints=select", "alignment.snapshots=[40]"
-    )
+    cfg = configuration(f"output={tmp_path}", "seeds=[0,1]", grid, "alignment.snapshots=[40]")
     # The snapshot is ahead at the common decoding and for seed 0; the last policy, at top-p 1, in the mean.
     scores = {("dpa_omf@40", 0.95): (0.7, 0.3), ("dpa_omf", 1.0): (0.5, 0.6), ("reference", 0.95): (0.4, 0.4)}
     asked = []
@@ -124,13 +132,26 @@ def test_checkpoint_and_decoding_are_chosen_together_by_the_mean_over_seeds(tmp_
     def evaluate(name: str, job: Any, config: Any, arguments: list[tuple]) -> None:
         asked.extend(arguments)
         for seed, policy, split, *decoding in arguments:
-            path = runs_of(config).evaluation(seed, policy, split, Decoding(*decoding))
+            path = runs_of(config).evaluation(seed, Run(policy, Decoding(*decoding)), split)
             write_json(path, {"mean": {"realism": scores.get((policy, decoding[0]), (0.1, 0.1))[seed]}})
 
     chosen = choose(cfg, SimpleNamespace(run=evaluate))
-    assert (chosen.policies["dpa_omf"], chosen.decodings["dpa_omf"]) == ("dpa_omf", Decoding(1.0, 1.0))
-    assert (chosen.policies["reference"], chosen.decodings["reference"]) == ("reference", Decoding(0.95, 1.0))
+    assert chosen.best["dpa_omf"] == Run("dpa_omf", Decoding(1.0, 1.0))
+    assert chosen.common["dpa_omf"] == Run("dpa_omf@40", Decoding(0.95, 1.0)), "the best one where all are compared"
+    assert chosen.best["reference"] == chosen.common["reference"] == Run("reference", Decoding(0.95, 1.0))
     assert len(asked) == len(set(asked)) == 2 * 2 * (1 + 2 * 5), "each policy of each seed once at each decoding"
+
+
+def test_a_budget_counts_what_a_method_starts_from_and_whom_it_learns_from() -> None:
+    own = {"steps": 150, "rollouts": 150 * 6 * 2, "start": "reference"}
+    rounds = configuration("experiment=rounds")
+    assert budget(rounds, "dpa_omf") == own
+    assert budget(rounds, "dpa_omf@75") == own | {"steps": 75, "rollouts": 75 * 6 * 2}
+    assert budget(rounds, "omf_round_3") == {"steps": 450, "rollouts": 450 * 6 * 2, "start": "omf_round_2"}
+    expert = budget(configuration("experiment=losses"), "afd_expert")
+    assert expert == own | {"steps": 300, "rollouts": 150 * 6 * 2 + 150 * 6}, (
+        "SFT reads one rollout where AfD reads two"
+    )
 
 
 # --- the account ----------------------------------------------------------------------------------------------------

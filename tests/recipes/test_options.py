@@ -9,10 +9,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
 from dpa.ranking import PreferenceDistance
-from recipes.cli import build, finished, recipe, write_json
+from recipes.cli import CONFIG, build, finished, recipe, write_json
+from recipes.scenes import open_splits
 
 RECIPES = ("pretrain", "collect", "align", "evaluate", "play", "ladder", "tokens", "compare", "validity", "sensitivity")
 WITHOUT_POLICY = ("pretrain", "ladder", "tokens", "compare", "play", "validity", "sensitivity")
@@ -209,7 +211,24 @@ def test_scenes_that_are_trained_and_evaluated_on_are_refused(
     run: Callable, options: Callable, stores: Path, tmp_path: Path
 ) -> None:
     command = options("pretrain", f"output={tmp_path}", f"scenes.eval={stores / 'train'}")
-    assert_refused(run("pretrain", *command), "scenes.train and scenes.eval share 8 scenes")
+    assert_refused(run("pretrain", *command), "scenes.train and scenes.eval share 6 scenes")  # two of the 8 are to tune
+
+
+def test_tuning_scenes_may_be_a_source_of_their_own(stores: Path) -> None:
+    def scenes(train: str, tune: str, held_out: str) -> DictConfig:
+        named = {"train": train, "tune": tune, "eval": held_out}
+        with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):
+            return compose(
+                "pretrain", ["scenes=store", *(f"scenes.{split}={stores / name}" for split, name in named.items())]
+            ).scenes
+
+    assert open_splits(scenes("train", "other", "eval")).sizes() == {"train": 8, "tune": 8, "eval": 3}
+    for names, told in {
+        ("train", "eval", "eval"): r"scenes\.tune and scenes\.eval share 3 scenes",
+        ("train", "train", "eval"): r"scenes\.train and scenes\.tune share 8 scenes",
+    }.items():
+        with pytest.raises(ValueError, match=told):
+            open_splits(scenes(*names))
 
 
 # --- what they are made of ------------------------------------------------------------------------------------------
@@ -249,7 +268,7 @@ def test_more_pairs_than_rollouts_are_refused(run: Callable, options: Callable, 
     policy, store = runs / "reference/policy.pt", runs / "preferences"
     command = options("align", f"policy={policy}", f"preferences={store}", f"output={tmp_path / 'out'}")
     command.append("method.data.num=8")
-    assert_refused(run("align", *command), "method.data.num=8 needs 16 rollouts of a scene and the store holds 4")
+    assert_refused(run("align", *command), "method.data.num=8 needs 16 rollouts of a scene and there are 4")
 
 
 def test_a_section_becomes_the_arguments_of_a_class() -> None:

@@ -274,7 +274,7 @@ def test_a_margin_leaves_the_clear_pairs(runs: Path, options: Callable) -> None:
         ({"margin": -1.0}, "a margin is 0 or more"),
         ({"rankings_per_scene": 0}, "must be more than 0"),
         ({"kind": "best", "num": 0}, "method.data.num must be 1 or more, got 0"),
-        ({"kind": "best", "num": 5}, "method.data.num=5 needs 5 rollouts of a scene and the store holds 4"),
+        ({"kind": "best", "num": 5}, "method.data.num=5 needs 5 rollouts of a scene and there are 4"),
         ({"kind": "sets", "num_unpreferred": 3}, "num=2 and num_unpreferred=3 needs 5 rollouts"),
         (
             {"kind": "sets", "num_unpreferred": None},

@@ -24,6 +24,9 @@ CARD: Mapping[str, Callable[[DataCard], str]] = {
     "on disk, per scene": lambda card: f"{card.scene_bytes / 1000:.1f} kB",
 }
 
+MANY = 10
+"""Stores that are shown only when asked for."""
+
 
 def account_section(study: Study) -> Section | None:
     """Compute account and data cards; None where the study has neither."""
@@ -52,14 +55,21 @@ def _stages(study: Study) -> list[Html]:
 def _cards(cards: Mapping[str, DataCard]) -> list[Html]:
     if not cards:
         return []
-    names = [name.replace("/preferences_", ", ").replace("_", " ") for name in cards]
-    rows = [[title, *(cell(card) for card in cards.values())] for title, cell in CARD.items()]
     shares = list(dict.fromkeys(feature for card in cards.values() for feature in card.feature_shares))
-    rows += [[f"distance made of {feature}", *(_share(card, feature) for card in cards.values())] for feature in shares]
+    rows = [
+        [
+            name.replace("/preferences_", ", ").replace("_", " "),
+            *(cell(card) for cell in CARD.values()),
+            *(_share(card, feature) for feature in shares),
+        ]
+        for name, card in cards.items()
+    ]
     origins = [folded(name, element("pre", card.origin.to_json())) for name, card in cards.items()]
+    titles = ["store", *CARD, *(f"distance made of {feature}" for feature in shares)]
     return [
-        element("h3", "Ranked rollouts of the references"),
-        table(["store", *names], rows),
+        element("h3", "Ranked rollouts"),
+        folded(f"{len(cards)} stores", table(titles, rows), open_=len(cards) < MANY),
+        hint("A person: the time that the paper's appendix G gives for ranking as many pairs by hand."),
         folded("what each store came from", *origins),
     ]
 

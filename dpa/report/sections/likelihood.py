@@ -22,7 +22,8 @@ FIGURES = {
     "nll_preferred": "NLL preferred", "nll_unpreferred": "NLL unpreferred",
     "nll_demonstration": "NLL log", "entropy": "entropy", "kl": "KL to reference",
 }  # fmt: skip
-DIGITS = {"pair_accuracy": 3, "reward_accuracy": 3}
+DIGITS = {"kl": 4}
+"""Of a figure after the point, where it is not 3."""
 SIDES = {
     "tune/nll_preferred": ("preferred", "#2a78b5"),
     "tune/nll_unpreferred": ("unpreferred", "#d55e00"),
@@ -62,7 +63,7 @@ def likelihood_table(experiment: Experiment, evaluations: Evaluations) -> Html:
     for method, of_method in by_method.items():
         cells = []
         for key in shown:
-            digits, base = DIGITS.get(key, 2), by_method.get(REFERENCE, [])
+            digits, base = DIGITS.get(key, 3), by_method.get(REFERENCE, [])
             found = None if method == REFERENCE else paired_figure(of_method, base, key, evaluations)
             cells.append(joined([number(_mean(of_method, key), digits), quiet_change(found, digits)], ""))
         rows.append([experiment.labels[method], *cells, sources([row["file"] for row in of_method])])

@@ -94,14 +94,14 @@ def differences(experiment: Experiment) -> Chart | None:
 
 
 def versus(experiment: Experiment) -> Chart | None:
-    """Forest of the other methods against the headline's; None where there is no other."""
+    """Forest of the other methods against ``experiment.versus``; None where there is no other."""
     found = _differences(experiment, experiment.own_best, experiment.own_best.versus)
     if not found:
         return None
-    headline = experiment.labels[experiment.headline]
-    caption = f"Each at its own best decoding, on {experiment.reported}. Against {headline}, {ordering(experiment)}."
-    title = f"Realism minus that of {headline}, 95 % intervals"
-    return forest({"own best": found}, title, x=f"difference in realism to {headline}", caption=caption)
+    standard = experiment.labels[experiment.versus]
+    caption = f"Each at its own best decoding, on {experiment.reported}. Against {standard}, {ordering(experiment)}."
+    title = f"Realism minus that of {standard}, 95 % intervals"
+    return forest({"own best": found}, title, x=f"difference in realism to {standard}", caption=caption)
 
 
 def matched_curves(experiment: Experiment, colours: Mapping[str, str]) -> list[Chart]:
@@ -152,7 +152,7 @@ def _main_table(experiment: Experiment, comparison: Comparison, evaluations: Eva
     columns = [column for column in COLUMNS if column.key in MAIN]
     against = {entry["method"]: entry for entry in comparison.versus}
     head = ["method", *(f"{column.title}\N{NO-BREAK SPACE}{column.better}" for column in columns)]
-    head += [*([f"Δ realism to {experiment.labels[experiment.headline]}"] if against else []), "seeds"]
+    head += [*([f"Δ realism to {experiment.labels[experiment.versus]}"] if against else []), "seeds"]
     rows, shown, base = [], set(), comparison.base()
     for record in _ordered(experiment, comparison):
         method, mine = record["method"], comparison.of(record["method"], decoding_of(record))
@@ -171,7 +171,8 @@ def _main_table(experiment: Experiment, comparison: Comparison, evaluations: Eva
         if against:
             entry = against.get(method, {})
             cells.append(stacked(entry.get("realism_difference"), entry.get("ci95")))
-        name = joined([experiment.labels[method], element("small", in_words(decoding_of(record)))], "")
+        steps = f", {count} steps" if (count := comparison.steps[method]) else ""
+        name = joined([experiment.labels[method], element("small", in_words(decoding_of(record)) + steps)], "")
         rows.append([name, *cells, sources([row["file"] for row in mine])])
     note, remarks = _which_loss(experiment), hint(" ".join(_remarks(experiment, comparison)))
     return joined([table(head, rows), *([element("p", note, class_="note")] if note else []), remarks])

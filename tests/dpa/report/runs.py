@@ -83,7 +83,9 @@ def write_experiment(
         "name": name, "title": f"Made-up {name}", "paper": "table 1" if published else None,
         "question": "Is <this> a test?", "metric": "2024", "scenes": scenes | {split: SCENES}, "split": split,
         "left_out": 0, "seeds": list(SEEDS), "methods": methods, "labels": {m: label(m) for m in methods},
-        "published": published or {}, "headline": headline, "common": list(COMMON),
+        "published": published or {}, "headline": headline, "versus": headline, "common": list(COMMON),
+        "steps": {at: {m: int(m.partition("@")[2] or 60) * (m != "reference") for m in methods}
+                  for at in ("common", "own_best")},
         "chosen": {method: list(decoding) for method, decoding in chosen.items()},
         "rows": [row(folder, m, s, d, split) for m, d in [*((m, COMMON) for m in methods), *sharper] for s in SEEDS],
         "paired": [paired(m, d, COMMON) for m, d in [*((m, COMMON) for m in others), *sharper]],

@@ -59,7 +59,9 @@ def entry(name: str, **changes: Any) -> Broken:
     [
         (without("common"), r"methods\.json has no common; make it again"),
         (lambda c: c.update(seeds=3), r"seeds must be list, got 3"),
-        (lambda c: c.update(headline="other"), r"methods must hold 'reference' and the headline 'other'"),
+        (lambda c: c.update(headline="other"), r"methods must hold 'reference', the headline 'other'"),
+        (lambda c: c.update(versus="other"), r"methods must hold .* and versus 'other', got reference"),
+        (lambda c: c["steps"]["common"].pop("dpa_omf"), r"steps\.common has no dpa_omf"),
         (lambda c: c["labels"].pop("dpa_omf@20"), r"labels has no entry for 'dpa_omf@20'"),
         (lambda c: c["labels"].update(dpa_omf=3e-4), r"labels\.dpa_omf must be str, got 0\.0003"),
         (lambda c: c["budget"]["dpa_omf"].update(start="x"), r"labels has no entry for 'x'"),

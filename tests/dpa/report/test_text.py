@@ -61,7 +61,9 @@ def test_values_and_differences_are_those_of_the_files(runs: Path, text: str) ->
     for entry in methods.own_best.versus:
         expected = difference(entry["realism_difference"], entry["ci95"])
         assert own[methods.labels[entry["method"]]]["Δ to DPA-OMF"] == [expected]
-    assert own["DPA-OMF"]["paper"] == ["0.739"] and own["reference"]["paper"] == ["–"]
+    assert own["DPA-OMF"]["steps"] == ["60"] and own["reference"]["steps"] == ["–"]
+    paper = own["*paper: DPA-OMF*"]
+    assert (paper["realism ↑"], paper["interactive ↑"], paper["steps"]) == (["0.739"], ["–"], ["–"])
 
 
 def test_likelihoods_are_means_over_seeds(runs: Path, text: str) -> None:
