@@ -90,7 +90,7 @@ def distance_of(store: PreferenceStore) -> PreferenceDistance:
     if unknown:
         raise ValueError(
             f"{store.folder} was ranked with the features {unknown}, which are not registered here; add them to "
-            "dpa/ranking/features.py."
+            "dpa/ranking/features/more.py."
         )
     names = [name for name in FEATURES if name in options["weights"]]  # JSON has lost their order
     return build(PreferenceDistance, DictConfig({**options, "features": names}), f"{store.folder}: ranking")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import torch
 from omegaconf import DictConfig
 
 from dpa.policy import SIZES, ContextOptions, MotionLM, MotionLMConfig
-from dpa.tokens import VerletTokenizer
+from dpa.tokens import MotionTokenizer, VerletTokenizer
 from dpa.training.checkpoint import load_policy, load_weights, save_policy
 from recipes.cli import build, plain
 
@@ -31,10 +32,11 @@ def policy_config(cfg: DictConfig) -> dict[str, Any]:
     if cfg.tokenizer.name not in TOKENIZERS:
         raise ValueError(f"model.tokenizer.name must be one of {sorted(TOKENIZERS)}, got {cfg.tokenizer.name!r}.")
     context = context_options(cfg)
-    if cfg.tokenizer.steps != context.decision_steps:
+    tokenizer = build_tokenizer(plain(cfg.tokenizer))
+    if tokenizer.steps != context.decision_steps:
         raise ValueError(
-            f"model.tokenizer.steps and model.context.decision_steps must be equal, got {cfg.tokenizer.steps} and "
-            f"{context.decision_steps}."
+            f"a token of model.tokenizer.name={cfg.tokenizer.name} has {tokenizer.steps} poses and "
+            f"model.context.decision_steps={context.decision_steps}; they must be equal."
         )
     size = SIZES[cfg.size].as_dict() | {"horizon": context.horizon, "dropout": cfg.dropout}
     return {"model": size, "tokenizer": plain(cfg.tokenizer), "context": asdict(context)}
@@ -42,8 +44,13 @@ def policy_config(cfg: DictConfig) -> dict[str, Any]:
 
 def build_policy(config: dict[str, Any]) -> MotionLM:
     """A fresh policy from :func:`policy_config`."""
-    tokenizer = dict(config["tokenizer"])
-    return MotionLM(MotionLMConfig(**config["model"]), TOKENIZERS[tokenizer.pop("name")](**tokenizer))
+    return MotionLM(MotionLMConfig(**config["model"]), build_tokenizer(config["tokenizer"]))
+
+
+def build_tokenizer(section: Mapping[str, Any]) -> MotionTokenizer:
+    """The tokenizer that ``name`` of a section names, with the section's other options."""
+    options = {key: value for key, value in section.items() if key != "name"}
+    return build(TOKENIZERS[section["name"]], DictConfig(options), f"model.tokenizer ({section['name']})")
 
 
 def write_policy(path: Path, model: MotionLM, config: dict[str, Any], metadata: dict[str, Any]) -> None:

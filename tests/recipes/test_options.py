@@ -13,7 +13,9 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
 from dpa.ranking import PreferenceDistance
+from dpa.tokens import VerletTokenizer
 from recipes.cli import CONFIG, build, finished, recipe, write_json
+from recipes.models import TOKENIZERS, build_policy, policy_config
 from recipes.scenes import open_splits
 
 RECIPES = ("pretrain", "collect", "align", "evaluate", "play", "ladder", "tokens", "compare", "validity", "sensitivity")
@@ -196,7 +198,7 @@ def test_options_that_make_no_sense_are_refused(
         ("+model.context.depth=3", ("model.context has no option 'depth'",)),
         ("model.context.horizon=17", ("horizon * decision_steps must be at most 80 steps", "17 * 5")),
         ("model.context.max_pieces=0", ("max_pieces must be positive, got 0",)),
-        ("model.tokenizer.steps=10", ("model.tokenizer.steps and model.context.decision_steps", "10 and 5")),
+        ("model.tokenizer.steps=10", ("has 10 poses and model.context.decision_steps=5", "must be equal")),
         ("logger.backend=paper", ("logger.backend must be csv, wandb or tensorboard, got 'paper'",)),
         ("seed=-1", ("seed must lie in", "-1")),
     ],
@@ -229,6 +231,21 @@ def test_tuning_scenes_may_be_a_source_of_their_own(stores: Path) -> None:
     }.items():
         with pytest.raises(ValueError, match=told):
             open_splits(scenes(*names))
+
+
+def test_a_tokenizer_of_ones_own_has_the_options_of_its_class(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Coarse(VerletTokenizer):
+        def __init__(self, table: str) -> None:
+            super().__init__(steps=len(table))
+
+    monkeypatch.setitem(TOKENIZERS, "coarse", Coarse)
+    with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):
+        cfg = OmegaConf.to_container(compose("pretrain", ["model=nano"]).model)
+    cfg["tokenizer"] = {"name": "coarse", "table": "five."}
+    assert build_policy(policy_config(OmegaConf.create(cfg))).tokenizer.steps == 5
+    cfg["tokenizer"]["table"] = "four"
+    with pytest.raises(ValueError, match=r"a token of model\.tokenizer\.name=coarse has 4 poses"):
+        policy_config(OmegaConf.create(cfg))
 
 
 # --- what they are made of ------------------------------------------------------------------------------------------
