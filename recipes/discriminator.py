@@ -32,13 +32,13 @@ from envs.seeding import make_generator
 from envs.store import SceneStore
 from recipes.adversary import best_look, fit
 from recipes.cli import CONFIG, build, finished, finite, plain, recipe, write_json
-from recipes.models import open_policy, weights_digest
+from recipes.models import open_policy, policies_of, weights_digest
 from recipes.motions import MotionShelf, Sight, driven_log
 from recipes.rankings import build_distance
 from recipes.rolled import Rolled
 from recipes.scenes import fingerprint, open_splits
 from recipes.spurious import QUANTITIES, RANKINGS, summarise
-from recipes.study import as_json, how_made, policies_of, rolled_out, shown, study_policy
+from recipes.study import as_json, how_made, rolled_out, shown, study_policy
 
 FIGURES = ("realism", "kinematic", "interactive", "map_based")
 RANDOM_GROUPS = 8

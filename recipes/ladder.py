@@ -29,8 +29,7 @@ from envs.progress import progress
 from envs.scene import CURRENT_STEP, STEP_SECONDS, Scene, SceneSource
 from envs.seeding import make_generator
 from recipes.cli import CONFIG, build, finished, plain, recipe, write_json
-from recipes.models import build_policy, context_options, open_policy, policy_config, weights_digest
-from recipes.play import named
+from recipes.models import build_policy, context_options, open_policy, policies_of, policy_config, weights_digest
 from recipes.rolled import rolled
 from recipes.scenes import fingerprint, open_splits
 
@@ -155,7 +154,7 @@ def rungs(cfg: DictConfig, scenes: SceneSource) -> Iterator[tuple[str, dict[str,
         yield name, {"tokenizer": plain(cfg.model.tokenizer)}, crude(scenes, rung, count, seed)
     decoding = {"decoding": plain(cfg.decoding)}
     models = {"untrained model": (untrained, context_options(cfg.model))}
-    for name, path in named(list(cfg.policies)).items():
+    for name, path in (policies_of(cfg) if cfg.policies else {}).items():
         model, context, _ = open_policy(path, cfg.device)
         models[name] = (model, context)
     for name, (model, context) in models.items():
@@ -168,13 +167,18 @@ def climb(cfg: DictConfig, scenes: SceneSource) -> dict[str, dict]:
     ladder = {}
     for name, own, rollouts in rungs(cfg, scenes):
         path = Path(cfg.output) / f"{name.replace(' ', '_').replace('/', '_')}.json"
-        decided_by = common | own | {"years": plain(cfg.years)}
+        decided_by = common | own | {"years": years_of(cfg)}
         done = finished(path, decided_by)
         if done is None:
-            done = {"options": decided_by, "scores": score_rung(scenes, rollouts, list(cfg.years), name)}
+            done = {"options": decided_by, "scores": score_rung(scenes, rollouts, years_of(cfg), name)}
             write_json(path, done)
         ladder[name] = done["scores"]
     return ladder
+
+
+def years_of(cfg: DictConfig) -> list[str]:
+    """Metrics to score by, as the keys of JSON are: 2024 is a number in YAML."""
+    return [str(year) for year in cfg.years]
 
 
 @hydra.main(**CONFIG, config_name="ladder")
@@ -182,17 +186,17 @@ def climb(cfg: DictConfig, scenes: SceneSource) -> dict[str, dict]:
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.ladder``."""
     scenes = open_splits(cfg.scenes)[cfg.split]
-    ladder = climb(cfg, scenes)
-    table = Table("rung", *(f"realism {year} [95 %]" for year in cfg.years), "minADE", "collision", "off-road")
-    last = list(cfg.years)[-1]
+    ladder, years = climb(cfg, scenes), years_of(cfg)
+    table = Table("rung", *(f"realism {year} [95 %]" for year in years), "minADE", "collision", "off-road")
+    last = years[-1]
     for name, scores in ladder.items():
-        means = [summary([scores[year]["realism"]]) for year in cfg.years]
+        means = [summary([scores[year]["realism"]]) for year in years]
         cells = [f"{found.mean:.3f} [{found.low:.3f}, {found.high:.3f}]" for found in means]
         rest = [torch.tensor(scores[last][key]).mean() for key in ("min_ade", "collision_rate", "offroad_rate")]
         table.add_row(name, *cells, *(f"{value:.3f}" for value in rest))
     Console(width=140).print(table)
     if cfg.json is not None:
-        write_json(cfg.json, {"scenes": len(scenes), "years": list(cfg.years), "rungs": ladder})
+        write_json(cfg.json, {"scenes": len(scenes), "years": years, "rungs": ladder})
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 
 from dpa.report.experiment import read_experiment
 from dpa.report.figures import plot_comparison
-from dpa.report.table import cells, header, summarise
+from dpa.report.table import REFERENCE, cells, header, summarise
 from dpa.training.loggers import make_logger
 from recipes.cli import plain
 from recipes.evaluate import SCENE_FIGURES
@@ -41,6 +41,11 @@ def log_experiment(cfg: DictConfig, found: Mapping[str, Any]) -> Path:
             values = {
                 f"{name}/{key}/{method}": record[key] for method, record in first.items() for key in SCENE_FIGURES
             }
+            for entry in each["paired"]:
+                if entry["method"] != REFERENCE:
+                    low, high = entry["ci95"]
+                    told = {"difference": entry["realism_difference"], "low": low, "high": high}
+                    values |= {f"{name}/realism_{end}/{entry['method']}": value for end, value in told.items()}
             logger.log({key: value for key, value in values.items() if value is not None}, 0)
         logger.log(_likelihoods(found), 0)
         with tempfile.TemporaryDirectory() as drawn:

@@ -71,6 +71,33 @@ def open_policy(path: str | Path, device: str = "cpu") -> tuple[MotionLM, Contex
     return model.to(device).eval(), ContextOptions(**config["context"]), config
 
 
+def policies_of(cfg: DictConfig) -> dict[str, Path]:
+    """Files of the policies that ``cfg.policies`` lists.
+
+    Args:
+        cfg: with ``policies``, a path or a list of them.
+
+    Returns:
+        By the name of their run's folder, or by their whole path where that is not enough.
+
+    Raises:
+        ValueError: it lists none.
+
+    Examples:
+        >>> cfg = DictConfig({"policies": ["runs/pretrain/policy.pt", "runs/dpa_omf/policy.pt"]})
+        >>> list(policies_of(cfg))
+        ['pretrain', 'dpa_omf']
+        >>> cfg.policies = ["seed_0/dpa_omf/policy.pt", "seed_1/dpa_omf/policy.pt"]
+        >>> list(policies_of(cfg))
+        ['seed_0/dpa_omf/policy.pt', 'seed_1/dpa_omf/policy.pt']
+    """
+    paths = [cfg.policies] if isinstance(cfg.policies, str) else list(cfg.policies)
+    if not paths:
+        raise ValueError("policies=[] names no policy; say for example policies=[runs/pretrain/policy.pt].")
+    names = [Path(path).parent.name for path in paths]
+    return dict(zip(names if len({*names}) == len(names) else paths, map(Path, paths), strict=True))
+
+
 def weights_digest(model: torch.nn.Module) -> str:
     """Digest of a policy's parameters."""
     digest = hashlib.sha256()

@@ -26,7 +26,7 @@ from dpa.rollout import make_collector
 from envs import keys
 from envs.store import SceneStore
 from recipes.cli import CONFIG, build, recipe
-from recipes.models import open_policy
+from recipes.models import open_policy, policies_of
 from recipes.rankings import build_distance
 from recipes.rolled import rolled
 from recipes.scenes import open_splits
@@ -119,19 +119,6 @@ def log_likelihood(batch: TensorDictBase, num_rollouts: int) -> Tensor:
     return (total / counts.sum((1, 2))).float().view(-1, num_rollouts).cpu()
 
 
-def named(paths: Sequence[str]) -> dict[str, Path]:
-    """Policies by the name of their run's folder, or by their whole path where that is not enough.
-
-    Examples:
-        >>> list(named(["runs/pretrain/policy.pt", "runs/dpa_omf/policy.pt"]))
-        ['pretrain', 'dpa_omf']
-        >>> list(named(["seed_0/dpa_omf/policy.pt", "seed_1/dpa_omf/policy.pt"]))
-        ['seed_0/dpa_omf/policy.pt', 'seed_1/dpa_omf/policy.pt']
-    """
-    names = [Path(path).parent.name for path in paths]
-    return dict(zip(names if len({*names}) == len(names) else paths, map(Path, paths), strict=True))
-
-
 def chosen_scenes(scenes: SceneStore, chosen: Sequence[int | str]) -> list[int]:
     """Indices of scenes that are given by id or by index.
 
@@ -148,7 +135,7 @@ def chosen_scenes(scenes: SceneStore, chosen: Sequence[int | str]) -> list[int]:
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.play``."""
-    policies = named([cfg.policies] if isinstance(cfg.policies, str) else list(cfg.policies))
+    policies = policies_of(cfg)
     scenes = open_splits(cfg.scenes)[cfg.split]
     players = roll_out(
         policies,

@@ -16,9 +16,8 @@ from dpa.rollout import make_collector
 from envs.progress import progress
 from envs.store import SceneStore
 from recipes.cli import build, finished, plain, write_json
-from recipes.models import open_policy, weights_digest
+from recipes.models import open_policy, policies_of, weights_digest
 from recipes.partial import PartialResult
-from recipes.play import named
 from recipes.provenance import pasteable
 from recipes.rankings import build_distance
 from recipes.rolled import Rolled, rolled
@@ -45,18 +44,6 @@ def study(cfg: DictConfig, scenes: SceneStore, measure: Measure, decided_by: dic
     """
     policies = policies_of(cfg)
     return {name: study_policy(cfg, scenes, path, measure, decided_by, name) for name, path in policies.items()}
-
-
-def policies_of(cfg: DictConfig) -> dict[str, Path]:
-    """Files of the policies that ``cfg.policies`` lists, by name.
-
-    Raises:
-        ValueError: it lists none.
-    """
-    policies = named([cfg.policies] if isinstance(cfg.policies, str) else list(cfg.policies))
-    if not policies:
-        raise ValueError("policies=[] names no policy; say for example policies=[runs/pretrain/policy.pt].")
-    return policies
 
 
 def study_policy(

@@ -18,6 +18,7 @@ SMALL = [
     "decoding.num_rollouts=2",
     "drift_rollouts=2",
     "alignment.watch_interval=2",
+    "alignment.snapshots=[2]",
 ]
 OF_THE_MACHINE = ("stages", "worker_seconds", "versions", "command", "config", "date", "revision", "machine")
 """What differs between two runs of the same options."""
@@ -53,8 +54,13 @@ def test_every_method_is_compared_with_the_reference(finished: Path) -> None:
     assert len(found["tuning"]) == 6 * 2 and found["left_out"] == 0
     assert {entry["against"] for entry in found["own_best"]["versus"]} == {"dpa_omf"}
     assert [entry["method"] for entry in found["own_best"]["versus"]] == METHODS[1:]
-    assert found["budget"]["dpa_omf"] == {"steps": 4, "rollouts": 16, "start": "reference"}
-    assert found["budget"]["sft_best_oa"]["rollouts"] == 8
+    assert found["steps"]["own_best"].keys() == {"reference", *METHODS}
+    for method, steps in found["steps"]["own_best"].items():
+        assert steps in ((2, 4) if method in METHODS else (0,)), "the snapshot or the last one"
+        files = [row["file"] for row in found["own_best"]["rows"] if row["method"] == method]
+        assert all(("/step_2/" in file) == (steps == 2) for file in files)
+    steps = found["steps"]["own_best"]["dpa_omf"]
+    assert found["budget"]["dpa_omf"] == {"steps": steps, "rollouts": 4 * steps, "start": "reference"}
     for row in found["rows"]:
         assert 0 < row["realism"] <= 1 and 0 <= row["pair_accuracy"] <= 1 and row["n_scenes"] == 3
     drift = {entry["method"]: entry["kl"] for entry in found["likelihood"]}
@@ -99,8 +105,6 @@ def test_every_experiment_runs_in_the_folder_of_the_first(
 ) -> None:
     reference = (finished / "seed_0/reference/policy.pt").stat().st_mtime_ns
     more = [f"experiment={name}"]
-    if name in ("scaling", "step_size"):
-        more.append("alignment.snapshots=[2]")
     if name == "scaling":  # four rollouts of a scene make one pair of its quarters
         more += [f"methods.omf_r{r}.data.rankings_per_scene=1" for r in (2, 4, 8)]
     outcome = run("compare", *command(options, finished, *more))

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable
 
 from dpa.report.markup import Section, element, hint, joined
 from dpa.report.study import STUDIES, Study
+
+OF_ONE = ("experiment", "method", "rankings", "pictures")
+"""Options that belong to one experiment alone."""
 
 
 def missing_section(study: Study, experiments: Iterable[str]) -> Section | None:
@@ -16,8 +20,9 @@ def missing_section(study: Study, experiments: Iterable[str]) -> Section | None:
         experiments: names of all that ``recipes.compare`` knows.
     """
     folder = study.folder
+    options = _options(study)
     lacking = {
-        f"experiment {name}": f"python -m recipes.compare experiment={name} output={folder}"
+        f"experiment {name}": shlex.join(["python", "-m", "recipes.compare", f"experiment={name}", *options])
         for name in experiments
         if name not in study.experiments
     }
@@ -29,9 +34,16 @@ def missing_section(study: Study, experiments: Iterable[str]) -> Section | None:
         if name not in study.summaries
     }
     if study.players is None:
-        lacking["scenes to play"] = f"python -m recipes.compare output={folder}"
+        lacking["scenes to play"] = shlex.join(["python", "-m", "recipes.compare", *options, "pictures.scenes=3"])
     if not lacking:
         return None
     rows = [element("li", name, ": ", element("code", command)) for name, command in lacking.items()]
-    about = hint("Add the options of the scenes that the commands of this page have.")
+    about = hint("Studies of rankings take the options of the scenes that the other commands have.")
     return Section("missing", "Not here yet", joined([element("ul", *rows), about]))
+
+
+def _options(study: Study) -> list[str]:
+    """Options of the main experiment's command that another experiment in the same folder has to share."""
+    given = shlex.split(study.main.command)[3:] if study.main is not None else []
+    kept = [each for each in given if not each.lstrip("+~").startswith(OF_ONE) and not each.startswith("output=")]
+    return [*kept, f"output={study.folder}"]

@@ -171,7 +171,8 @@ def likelihoods(method: str) -> dict[str, list[float]]:
     """Likelihood in every scene: the same difference from the reference in each."""
     learns = method.startswith("dpa_omf")
     level = {
-        "pair_accuracy": 0.65 if learns else 0.51, "nll_demonstration": 4.0, "nll_preferred": 2.0 - 0.3 * learns,
+        "pair_accuracy": 0.65 if learns else 0.51, "reward_accuracy": 0.7 if learns else 0.5,
+        "nll_demonstration": 4.0, "nll_preferred": 2.0 - 0.3 * learns,
         "nll_unpreferred": 2.1 + 0.4 * learns, "entropy": 1.9,
         "kl": 0.0 if method == "reference" else 0.3 * float(method.partition("@")[2] or 60) / 60,
     }  # fmt: skip

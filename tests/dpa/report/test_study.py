@@ -235,13 +235,14 @@ def test_table_3_has_pair_accuracy_realism_and_min_ade(page: Page, methods: dict
 
 
 def test_likelihood_is_a_table_that_names_its_files(page: Page) -> None:
-    cells = next(row for row in table(page, "method", "pair accuracy ↑", "NLL preferred") if row[0] == "DPA-OMF")
-    assert cells[1:4] == ["0.650+0.140[+0.140, +0.140]", "1.700−0.300[−0.300, −0.300]", "2.500+0.400[+0.400, +0.400]"]
-    assert cells[4:6] == ["4.0000.000[0.000, 0.000]", "1.9000.000[0.000, 0.000]"]
+    cells = next(row for row in table(page, "method", "pair accuracy ↑", "reward accuracy ↑") if row[0] == "DPA-OMF")
+    assert cells[1:3] == ["0.650+0.140[+0.140, +0.140]", "0.700+0.200[+0.200, +0.200]"]
+    assert cells[3:5] == ["1.700−0.300[−0.300, −0.300]", "2.500+0.400[+0.400, +0.400]"]
+    assert cells[5:7] == ["4.0000.000[0.000, 0.000]", "1.9000.000[0.000, 0.000]"]
     scenes = np.tile(0.3 + np.linspace(-0.1, 0.1, 12), (3, 1))
     kl = paired_bootstrap(scenes, 0 * scenes, RESAMPLES)
-    assert cells[6] == "0.3000" + stacked(kl.mean, (kl.low, kl.high), 4)
-    assert "seed_2/dpa_omf/likelihood_eval.json" in cells[7]
+    assert cells[7] == "0.3000" + stacked(kl.mean, (kl.low, kl.high), 4)
+    assert "seed_2/dpa_omf/likelihood_eval.json" in cells[8]
 
 
 def test_likelihood_along_training_has_a_line_for_each_seed_and_their_mean(page: Page) -> None:
@@ -368,13 +369,15 @@ def test_what_is_missing_is_named_with_its_command(copied: Path, tmp_path: Path)
         shutil.rmtree(copied / name)
     (copied / "players.json").unlink()
     (copied / "experiments" / "steps.json").unlink()
+    given = "python -m recipes.compare scenes=made experiment=methods '~methods.cpl' 'seeds=[0,1,2]' output=elsewhere"
+    change(copied, "methods", command=given)
     study = read_study(copied)
     page = Page(write_study(tmp_path / "p.html", study, experiments=["methods", "steps"]).read_text(encoding="utf-8"))
     missing = page.text.partition("Not here yet")[2]
     for wanted in (
-        f"experiment steps: python -m recipes.compare experiment=steps output={copied}",
+        f"experiment steps: python -m recipes.compare experiment=steps scenes=made 'seeds=[0,1,2]' output={copied}",
         "validity: python -m recipes.validity policies=[POLICY.pt]",
-        "scenes to play: python -m recipes.compare",
+        f"scenes to play: python -m recipes.compare scenes=made 'seeds=[0,1,2]' output={copied} pictures.scenes=3",
     ):
         assert wanted in missing
     assert "sensitivity: " not in missing and "experiment methods" not in missing
