@@ -48,7 +48,7 @@ SECTIONS = {
     "pretrain": ("threads", "scenes", "model", "pretraining"),
     "collect": ("threads", "scenes", "collection"),
     "align": ("threads", "scenes", "alignment"),
-    "evaluate": ("threads", "scenes", "collection", "evaluation"),
+    "evaluate": ("threads", "scenes", "collection.ranking", "evaluation"),
     "play": ("threads", "scenes"),
     "rerank": ("threads", "scenes"),
     "spread": ("threads", "scenes"),
@@ -84,7 +84,7 @@ def options(stores: Path) -> Callable[..., list[str]]:
     """Tiny options of a recipe, and what is given on top."""
 
     def options_of(recipe: str, *more: str) -> list[str]:
-        tiny = [option for option in TINY if option.split("=")[0].split(".")[0] in SECTIONS[recipe]]
+        tiny = [option for option in TINY if option.split("=")[0].startswith(SECTIONS[recipe])]
         return [*tiny, f"scenes.train={stores / 'train'}", f"scenes.eval={stores / 'eval'}", *more]
 
     return options_of
