@@ -14,6 +14,10 @@ from dpa.rollout.crew import Outcome, Workers
 from dpa.rollout.job import RolloutJob, RolloutWorker
 from dpa.rollout.plan import RolloutTask
 from envs.allocator import keep_freed_memory
+from envs.progress import message
+
+PATIENCE = 60.0
+"""Seconds without an answer after which the state of the cluster is told."""
 
 
 class RayCrew:
@@ -32,6 +36,7 @@ class RayCrew:
             self._ray.init(address=workers.address, include_dashboard=False, log_to_driver=False, logging_level="error")
         self.size = workers.count
         needs = {"num_cpus": workers.threads, "num_gpus": int(str(job.device).startswith("cuda"))}
+        self._needs = f"{needs['num_cpus']} CPUs and {needs['num_gpus']} GPUs"
         self._hire = self._ray.remote(**needs, max_restarts=0)(_Hand).remote
         self._threads = workers.threads
         self._job = self._ray.put(replace(job, model=job.model.cpu(), device=str(job.device)))
@@ -45,7 +50,7 @@ class RayCrew:
 
     def wait(self) -> tuple[int, Outcome]:
         """See :class:`~dpa.rollout.crew.Crew`."""
-        (ready, *_), _ = self._ray.wait(list(self._running), num_returns=1)
+        ready = self._ready()
         worker = self._running.pop(ready)
         try:
             return worker, Outcome(self._ray.get(ready))
@@ -54,6 +59,18 @@ class RayCrew:
         except self._ray.exceptions.RayActorError:
             self._hands[worker] = self._start()
             return worker, Outcome()
+
+    def _ready(self) -> Any:
+        """The next task that is done. A cluster that lacks what the workers need lets them wait without a word."""
+        while True:
+            ready, _ = self._ray.wait(list(self._running), num_returns=1, timeout=PATIENCE)
+            if ready:
+                return ready[0]
+            free, have = self._ray.available_resources(), self._ray.cluster_resources()
+            told = ", ".join(f"{free.get(kind, 0):g} of {have.get(kind, 0):g} {kind}s free" for kind in ("CPU", "GPU"))
+            message(
+                f"no Ray worker has answered for {PATIENCE:g} s: the cluster has {told}, a worker needs {self._needs}."
+            )
 
     def update(self, weights: Mapping[str, Tensor] | None, seed: int) -> None:
         """See :class:`~dpa.rollout.crew.Crew`."""

@@ -7,6 +7,7 @@ import signal
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import torch
@@ -267,6 +268,7 @@ def test_it_is_a_collector_of_torchrl(stepwise: Callable) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)  # seven actors import torch: half a minute, and ten times that beside other work
 def test_a_ray_cluster_gives_the_same_rollouts_and_survives_a_killed_worker(
     collect: Callable, stepwise: Callable, model: MotionLM, tmp_path: Path
 ) -> None:
@@ -279,5 +281,10 @@ def test_a_ray_cluster_gives_the_same_rollouts_and_survives_a_killed_worker(
         with pytest.raises(ValueError, match="no such feature"):
             collect(workers=workers, make_postproc=fail)
         test_new_weights_drive_from_the_next_batch_on(stepwise, collect, model, workers)
+        wanting = mock.Mock(side_effect=InterruptedError)
+        impatient = mock.patch.multiple("dpa.rollout.ray_crew", PATIENCE=0.1, message=wanting)
+        with impatient, pytest.raises(InterruptedError):
+            collect(workers=Workers(1, "ray", threads=4096))
+        assert "CPUs free" in wanting.call_args[0][0] and "needs 4096 CPUs" in wanting.call_args[0][0]
     finally:
         ray.shutdown()
