@@ -12,8 +12,8 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from dpa.policy import Decoding
-from dpa.report.curves import read_curves
 from dpa.report.table import REFERENCE
+from dpa.training.loggers import read_curve
 from dpa.training.run import SECONDS
 from envs.seeding import make_generator
 from recipes.align import align
@@ -85,8 +85,8 @@ def align_job(cfg: DictConfig, seed: int, method: str) -> dict[str, float]:
 
 def seconds_trained(folder: Path) -> float:
     """What the steps of a training run took [s], whichever processes made them."""
-    curve = read_curves(folder)[SECONDS]
-    return curve["value"][-1] * curve["step"][-1]
+    steps, seconds_per_step = read_curve(folder, SECONDS)[-1]
+    return steps * seconds_per_step
 
 
 def evaluate_job(cfg: DictConfig, seed: int, policy: str, split: str, top_p: float, temperature: float) -> None:

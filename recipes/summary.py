@@ -56,10 +56,15 @@ class Results:
 
     def rows(self, shown: Sequence[Shown]) -> list[dict[str, Any]]:
         """Means of several runs over the reported scenes, each for all seeds, with the file behind each."""
-        return [self._row(method, run, seed, self.split) for method, run in shown for seed in self.seeds]
+        return [
+            self._row(method, run, seed, self.split)
+            | {"pair_accuracy": self.likelihood(method, run.policy, seed)["pair_accuracy"]}
+            for method, run in shown
+            for seed in self.seeds
+        ]
 
     def tuning(self, shown: Sequence[Shown]) -> list[dict[str, Any]]:
-        """The same over all tuning scenes."""
+        """Means over the tuning scenes, likewise."""
         return [self._row(method, run, seed, "tune") for method, run in shown for seed in self.seeds]
 
     def likelihood(self, method: str, policy: str, seed: int) -> dict[str, Any]:
@@ -134,17 +139,6 @@ def summarise_experiment(
     results = Results(cfg, [*at_common, *others, *at_best])
     standard = experiment["versus"] or experiment["headline"]
     rivals = [run for run in at_best if run[0] not in (REFERENCE, standard)]
-    accuracy = {
-        (run.policy, seed): results.likelihood(method, run.policy, seed)["pair_accuracy"]
-        for method, run in [*at_common, *at_best]
-        for seed in cfg.seeds
-    }
-
-    def rows(shown: list[Shown]) -> list[dict[str, Any]]:
-        policies = [run.policy for _, run in shown for _ in cfg.seeds]
-        found = zip(results.rows(shown), policies, strict=True)
-        return [row | {"pair_accuracy": accuracy[policy, row["seed"]]} for row, policy in found]
-
     return {name: experiment[name] for name in TOLD} | {
         "versus": standard,
         "metric": str(cfg.evaluation.metric),
@@ -159,10 +153,10 @@ def summarise_experiment(
         "common": [common.top_p, common.temperature],
         "chosen": {method: [run.decoding.top_p, run.decoding.temperature] for method, run in at_best},
         "left_out": results.known.count(False),
-        "rows": rows(at_common + others),
+        "rows": results.rows(at_common + others),
         "paired": results.paired(at_common[1:] + others, at_common[0]),
         "own_best": {
-            "rows": rows(at_best),
+            "rows": results.rows(at_best),
             "paired": results.paired(at_best[1:], at_best[0]),
             "versus": results.paired(rivals, (standard, chosen.best[standard])),
         },

@@ -7,7 +7,6 @@ anything else.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
@@ -26,6 +25,7 @@ from dpa.report.sections.origin import study_section
 from dpa.report.sections.rankings import discriminator_section, sensitivity_section, validity_section
 from dpa.report.sections.results import experiment_section
 from dpa.report.study import Evaluations, Study
+from envs.shards import write_bytes
 
 SHOWS = {"validity": validity_section, "sensitivity": sensitivity_section, "discriminator": discriminator_section}
 
@@ -133,7 +133,5 @@ def write_whole(path: Path, text: str) -> Path:
         ``path``.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.name}.part")
-    part.write_text(text, encoding="utf-8")
-    os.replace(part, path)
+    write_bytes(path, text.encode())
     return path
