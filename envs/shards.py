@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections import Counter
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -18,6 +17,7 @@ from typing import Any, TypeVar
 
 from envs.card import Card
 from envs.codec import decode, encode
+from envs.files import write_bytes
 from envs.framing import Framing
 from envs.scene import Scene, SceneError
 from envs.sources.fields import one_line, shown
@@ -29,8 +29,6 @@ FORMAT_VERSION = 2
 """Of the files in a store; a store of another version must be converted again."""
 SUFFIX = ".scenes"
 """Of a shard's file."""
-PARTIAL_PREFIX = ".partial-"
-"""Files that are being written; left over only by a process that was killed."""
 
 MAX_JSON = 1 << 27
 """Bytes of a manifest; one that lists a hundred thousand bad inputs has about 2^25."""
@@ -274,24 +272,6 @@ def file_digest(path: Path) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except FileNotFoundError as error:
         raise SceneError(f"{path}: the file is missing; convert the scenes again.") from error
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file so that readers see the old one or the new one, never a part, whatever ends the process."""
-    partial = path.with_name(f"{PARTIAL_PREFIX}{path.name}-{os.getpid()}")
-    try:
-        with partial.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON like :func:`write_bytes`."""
-    write_bytes(path, (json.dumps(content) + "\n").encode())
 
 
 def read_versioned(path: Path, cls: type[Content], shape: dict[str, Any]) -> Content:

@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from envs.files import write_json
 from envs.scene import Lacks, Scene, SceneError
-from envs.shards import FORMAT_VERSION, SUFFIX, Shard, file_digest, read_versioned, write_json
+from envs.shards import FORMAT_VERSION, SUFFIX, Shard, file_digest, read_versioned
 from envs.sources.fields import shown
 
 MANIFEST_FILE = "manifest.json"
@@ -63,7 +64,7 @@ _MANIFEST_SHAPE = {
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write or replace the manifest of a store."""
-    write_json(folder / MANIFEST_FILE, {"version": FORMAT_VERSION, **asdict(manifest)})
+    write_json(folder / MANIFEST_FILE, {"version": FORMAT_VERSION, **asdict(manifest)}, indent=None)
 
 
 def read_manifest(folder: Path) -> Manifest:

@@ -23,17 +23,18 @@ from dpa.training.distributed import ALONE, Ranks, join_ranks
 from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
 from dpa.training.run import Run
 from dpa.training.seeding import seed_everything
+from envs.files import write_json
 from envs.progress import message
 from envs.seeding import make_generator
 from envs.store import SceneStore
-from recipes.candidates import Candidates, make_candidates
-from recipes.cli import CONFIG, check_steps, deciding, finished, finite, plain, ranked_recipe, write_json
-from recipes.draws import parts_of
-from recipes.losses import check_fit, make_loss
-from recipes.models import open_policy, weights_digest, write_policy
-from recipes.rankings import open_preferences
-from recipes.scenes import fingerprint, open_splits
-from recipes.watch import Look, Watch
+from recipes.alignment.candidates import Candidates, make_candidates
+from recipes.alignment.draws import parts_of
+from recipes.alignment.losses import check_fit, make_loss
+from recipes.alignment.watch import Look, Watch
+from recipes.common.cli import CONFIG, check_steps, deciding, finished, finite, plain, ranked_recipe
+from recipes.common.models import open_policy, weights_digest, write_policy
+from recipes.common.rankings import open_preferences
+from recipes.common.scenes import fingerprint, open_splits
 
 OBSERVING = ("checkpoint_interval", "max_rows", "snapshots", "watch_interval", "watch_scenes", "watch_pairs")
 """Options of the section ``alignment`` that change nothing about the policy."""

@@ -23,12 +23,13 @@ from dpa.ranking import Distance
 from dpa.ranking.transform import RankRollouts
 from dpa.rollout import Workers, make_collector
 from dpa.rollout.collector import rows_within
+from envs.files import write_json
 from envs.progress import progress
 from envs.store import SceneStore
-from recipes.cli import CONFIG, build, plain, recipe, write_json
-from recipes.models import open_policy, weights_digest
-from recipes.rankings import build_distance
-from recipes.scenes import fingerprint, open_splits
+from recipes.common.cli import CONFIG, build, plain, recipe
+from recipes.common.models import open_policy, weights_digest
+from recipes.common.rankings import build_distance
+from recipes.common.scenes import fingerprint, open_splits
 
 
 def collect(

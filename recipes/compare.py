@@ -22,9 +22,12 @@ from omegaconf import DictConfig
 from dpa.policy import Decoding
 from dpa.report.experiment import read_json
 from dpa.report.table import REFERENCE, print_table
-from recipes.check import check_experiment
-from recipes.cli import CONFIG, recipe, write_json
-from recipes.jobs import (
+from envs.files import write_json
+from recipes.common.cli import CONFIG, recipe
+from recipes.common.provenance import provenance
+from recipes.common.scenes import open_splits
+from recipes.experiment.check import check_experiment
+from recipes.experiment.jobs import (
     align_job,
     collect_job,
     evaluate_job,
@@ -33,16 +36,14 @@ from recipes.jobs import (
     rerank_job,
     runs_of,
 )
-from recipes.logged import log_experiment
-from recipes.methods import levels, read_setups, setup_of
-from recipes.pictures import write_players
-from recipes.pool import Workers
-from recipes.provenance import provenance
+from recipes.experiment.logged import log_experiment
+from recipes.experiment.methods import levels, read_setups, setup_of
+from recipes.experiment.pictures import write_players
+from recipes.experiment.pool import Workers
+from recipes.experiment.runs import SNAPSHOT, Run
+from recipes.experiment.stages import Stages, alone_in
+from recipes.experiment.summary import Chosen, summarise_experiment
 from recipes.report import report
-from recipes.runs import SNAPSHOT, Run
-from recipes.scenes import open_splits
-from recipes.stages import Stages, alone_in
-from recipes.summary import Chosen, summarise_experiment
 
 
 def compare(cfg: DictConfig) -> dict[str, Any]:
@@ -134,7 +135,7 @@ def decodings(cfg: DictConfig) -> list[Decoding]:
 
 
 def jobs_of(cfg: DictConfig, runs: Iterable[Run], split: str) -> list[tuple[int, str, str, float, float]]:
-    """Arguments of :func:`~recipes.jobs.evaluate_job` for some runs and all seeds."""
+    """Arguments of :func:`~recipes.experiment.jobs.evaluate_job` for some runs and all seeds."""
     each = ((run.policy, split, run.decoding.top_p, run.decoding.temperature) for run in runs)
     return sorted((seed, *run) for run, seed in product(each, cfg.seeds))
 

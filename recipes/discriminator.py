@@ -28,17 +28,18 @@ from dpa.realism import realism_of_groups
 from dpa.report.studies import plot_discriminator
 from dpa.tokens import MotionTokenizer
 from dpa.training.checkpoint import load_policy, load_weights, save_policy
+from envs.files import write_json
 from envs.seeding import make_generator
 from envs.store import SceneStore
-from recipes.adversary import best_look, fit
-from recipes.cli import CONFIG, build, finished, finite, plain, recipe, write_json
-from recipes.models import open_policy, policies_of, weights_digest
-from recipes.motions import MotionShelf, Sight, driven_log
-from recipes.rankings import build_distance
-from recipes.rolled import Rolled
-from recipes.scenes import fingerprint, open_splits
-from recipes.spurious import QUANTITIES, RANKINGS, summarise
-from recipes.study import as_json, how_made, rolled_out, shown, study_policy
+from recipes.common.cli import CONFIG, build, finished, finite, plain, recipe
+from recipes.common.models import open_policy, policies_of, weights_digest
+from recipes.common.rankings import build_distance
+from recipes.common.rolled import Rolled
+from recipes.common.scenes import fingerprint, open_splits
+from recipes.studies.adversary import best_look, fit
+from recipes.studies.motions import MotionShelf, Sight, driven_log
+from recipes.studies.spurious import QUANTITIES, RANKINGS, summarise
+from recipes.studies.study import as_json, how_made, rolled_out, shown, study_policy
 
 FIGURES = ("realism", "kinematic", "interactive", "map_based")
 RANDOM_GROUPS = 8

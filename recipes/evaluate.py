@@ -21,15 +21,16 @@ from dpa.realism import RealismResult, mean_result, realism
 from dpa.realism.submission import SubmissionWriter, plan_submission
 from dpa.rollout import make_collector
 from dpa.safety import MEASURES, safety
+from envs.files import write_json
 from envs.progress import progress
 from envs.scene import CURRENT_STEP
 from envs.store import SceneStore
-from recipes.cli import CONFIG, build, deciding, finished, finite, recipe, write_json
-from recipes.models import open_policy, weights_digest
-from recipes.partial import PartialResult
-from recipes.rankings import build_distance
-from recipes.rolled import Rolled, rolled
-from recipes.scenes import fingerprint, open_splits
+from recipes.common.cli import CONFIG, build, deciding, finished, finite, recipe
+from recipes.common.models import open_policy, weights_digest
+from recipes.common.partial import PartialResult
+from recipes.common.rankings import build_distance
+from recipes.common.rolled import Rolled, rolled
+from recipes.common.scenes import fingerprint, open_splits
 
 STANDING, MOVED = 0.5, 2.0
 """An agent whose log moves less than the first stands; one that a rollout moves more than the second does not [m]."""

@@ -25,13 +25,14 @@ from dpa.report.statistics import summary
 from dpa.rollout import lifted, make_collector
 from dpa.tokens import MotionTokenizer
 from dpa.training.seeding import seed_everything
+from envs.files import write_json
 from envs.progress import progress
 from envs.scene import CURRENT_STEP, STEP_SECONDS, Scene, SceneSource
 from envs.seeding import make_generator
-from recipes.cli import CONFIG, build, finished, plain, recipe, write_json
-from recipes.models import build_policy, context_options, open_policy, policies_of, policy_config, weights_digest
-from recipes.rolled import rolled
-from recipes.scenes import fingerprint, open_splits
+from recipes.common.cli import CONFIG, build, finished, plain, recipe
+from recipes.common.models import build_policy, context_options, open_policy, policies_of, policy_config, weights_digest
+from recipes.common.rolled import rolled
+from recipes.common.scenes import fingerprint, open_splits
 
 Rung = Callable[[Scene, int, torch.Generator], Tensor]
 """Scene, number of rollouts and generator -> ``[R, A, 80, 4]``."""

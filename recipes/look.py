@@ -23,11 +23,11 @@ from dpa.report.ranked import plot_ranked
 from envs import keys
 from envs.scene import Scene
 from envs.store import SceneStore
-from recipes.cli import CONFIG, build, recipe
-from recipes.models import open_policy
-from recipes.rankings import open_preferences
-from recipes.rolled import stored
-from recipes.scenes import open_splits
+from recipes.common.cli import CONFIG, build, recipe
+from recipes.common.models import open_policy
+from recipes.common.rankings import open_preferences
+from recipes.common.rolled import stored
+from recipes.common.scenes import open_splits
 
 FIGURES = ("coupling", "rollouts")
 TOLERANCE = 0.01

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 from rich.console import Console
 from rich.table import Table
 
-from recipes.cli import write_json
+from envs.files import write_json
 
 STEPS = 80
 """Of an episode, of 0.1 s."""

@@ -25,11 +25,11 @@ from dpa.report.player import PlayerScene
 from dpa.rollout import make_collector
 from envs import keys
 from envs.store import SceneStore
-from recipes.cli import CONFIG, build, recipe
-from recipes.models import open_policy, policies_of
-from recipes.rankings import build_distance
-from recipes.rolled import rolled
-from recipes.scenes import open_splits
+from recipes.common.cli import CONFIG, build, recipe
+from recipes.common.models import open_policy, policies_of
+from recipes.common.rankings import build_distance
+from recipes.common.rolled import rolled
+from recipes.common.scenes import open_splits
 
 PAPER_DISTANCE = PreferenceDistance()
 

@@ -28,13 +28,14 @@ from dpa.training.run import Run
 from dpa.training.seeding import seed_everything
 from envs import keys
 from envs.augment import Augmentation
+from envs.files import write_json
 from envs.loader import SceneLoader
 from envs.progress import progress
 from envs.scene import SceneSource
 from envs.seeding import make_generator
-from recipes.cli import CONFIG, build, check_steps, finished, plain, ranked_recipe, write_json
-from recipes.models import build_policy, context_options, policy_config, write_policy
-from recipes.scenes import Splits, fingerprint, open_splits
+from recipes.common.cli import CONFIG, build, check_steps, finished, plain, ranked_recipe
+from recipes.common.models import build_policy, context_options, policy_config, write_policy
+from recipes.common.scenes import Splits, fingerprint, open_splits
 
 
 def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path, ranks: Ranks = ALONE) -> Path:

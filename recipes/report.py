@@ -17,7 +17,7 @@ from dpa.report.figures import plot_comparison
 from dpa.report.page import write_study, write_whole
 from dpa.report.study import read_study
 from dpa.report.text import study_text
-from recipes.cli import refused
+from recipes.common.cli import refused
 
 EXPERIMENTS = Path(__file__).parent / "config" / "experiment"
 """One YAML for each experiment that recipes.compare knows."""

@@ -18,11 +18,11 @@ from dpa.ranking.distance import rank_of
 from envs import keys
 from envs.progress import progress
 from envs.store import SceneStore
-from recipes.cli import CONFIG, recipe
-from recipes.models import open_policy
-from recipes.rankings import build_distance, open_preferences
-from recipes.rolled import stored
-from recipes.scenes import open_splits
+from recipes.common.cli import CONFIG, recipe
+from recipes.common.models import open_policy
+from recipes.common.rankings import build_distance, open_preferences
+from recipes.common.rolled import stored
+from recipes.common.scenes import open_splits
 
 
 def rerank(ranking: DictConfig, scenes: SceneStore, policy: Path, preferences: Path, folder: Path) -> PreferenceStore:

@@ -26,10 +26,11 @@ from dpa.ranking import Distance
 from dpa.ranking.agreement import rank_correlation, same_order
 from dpa.report.statistics import Interval, summary
 from dpa.report.studies import plot_sensitivity
-from recipes.cli import CONFIG, recipe, write_json
-from recipes.rolled import Rolled
-from recipes.scenes import open_splits
-from recipes.study import as_json, distances_of, how_made, over_scenes, shown, study
+from envs.files import write_json
+from recipes.common.cli import CONFIG, recipe
+from recipes.common.rolled import Rolled
+from recipes.common.scenes import open_splits
+from recipes.studies.study import as_json, distances_of, how_made, over_scenes, shown, study
 
 ADE = "ade"
 MARGINS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, np.inf)

@@ -19,12 +19,13 @@ from rich.console import Console
 from rich.table import Table
 
 from dpa.ranking.features import FEATURES, feature_names, feature_weights, log_trajectory, occupancy_features
+from envs.files import write_json
 from envs.progress import progress
-from recipes.cli import CONFIG, recipe, write_json
-from recipes.models import open_policy
-from recipes.rankings import open_preferences
-from recipes.rolled import Rolled, stored
-from recipes.scenes import open_splits
+from recipes.common.cli import CONFIG, recipe
+from recipes.common.models import open_policy
+from recipes.common.rankings import open_preferences
+from recipes.common.rolled import Rolled, stored
+from recipes.common.scenes import open_splits
 
 
 class Spread(NamedTuple):

@@ -14,12 +14,13 @@ from rich.table import Table
 
 from dpa.policy import ContextOptions, make_context
 from dpa.tokens import MotionTokenizer
+from envs.files import write_json
 from envs.geometry.frames import wrap_angle
 from envs.progress import progress
 from envs.scene import STEP_SECONDS, AgentKind, SceneSource
-from recipes.cli import CONFIG, plain, recipe, write_json
-from recipes.models import build_policy, context_options, policy_config
-from recipes.scenes import open_splits
+from recipes.common.cli import CONFIG, plain, recipe
+from recipes.common.models import build_policy, context_options, policy_config
+from recipes.common.scenes import open_splits
 
 CLASSES = (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST)
 MOVING = 1.0

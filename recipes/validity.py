@@ -25,11 +25,12 @@ from dpa.ranking.agreement import rank_correlation
 from dpa.realism import realism_of_groups
 from dpa.report.statistics import Interval, paired_bootstrap, summary
 from dpa.report.studies import plot_validity
+from envs.files import write_json
 from envs.seeding import make_generator
-from recipes.cli import CONFIG, finite, plain, recipe, write_json
-from recipes.rolled import Rolled
-from recipes.scenes import open_splits
-from recipes.study import as_json, distances_of, how_made, over_scenes, shown, study
+from recipes.common.cli import CONFIG, finite, plain, recipe
+from recipes.common.rolled import Rolled
+from recipes.common.scenes import open_splits
+from recipes.studies.study import as_json, distances_of, how_made, over_scenes, shown, study
 
 FIGURES = ("realism", "kinematic", "interactive", "map_based")
 RANDOM_GROUPS = 8

@@ -18,9 +18,9 @@ from envs import keys
 from envs.convert.__main__ import make_parser as convert_parser
 from envs.sources import SOURCES
 from envs.sources.sumo import parse, units
+from recipes.alignment.losses import LOSSES
 from recipes.benchmark.__main__ import make_parser as benchmark_parser
-from recipes.losses import LOSSES
-from recipes.models import TOKENIZERS
+from recipes.common.models import TOKENIZERS
 from recipes.plan import make_parser as plan_parser
 from recipes.report import make_parser as report_parser
 

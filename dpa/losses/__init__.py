@@ -1,6 +1,7 @@
 """Losses as TorchRL ``LossModule``s: next token (eq. 1) and preferences (eq. 4 and its relatives)."""
 
 from dpa.losses.contrastive import ContrastivePreferenceLoss
+from dpa.losses.imitation import ImitationLoss
 from dpa.losses.kahneman_tversky import KahnemanTverskyLoss
 from dpa.losses.network import token_network
 from dpa.losses.next_token import NextTokenLoss
@@ -11,6 +12,7 @@ from dpa.losses.saturation import SaturationWatch
 __all__ = [
     "Comparison",
     "ContrastivePreferenceLoss",
+    "ImitationLoss",
     "KahnemanTverskyLoss",
     "NextTokenLoss",
     "PlackettLuceLoss",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from tensordict.nn import TensorDictModule
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictParams
 from torch import Tensor, nn
 
 CONTEXT = "context"
@@ -17,6 +18,12 @@ def token_network(model: nn.Module) -> TensorDictModule:
             ``[S, M or 1, A, T]``; gives logits ``[S, M, A, T, V]`` (:class:`~dpa.policy.MotionLM` does).
     """
     return TensorDictModule(model, in_keys=[CONTEXT, "tokens", "token_valid"], out_keys=[LOGITS])
+
+
+def logits_under(parameters: TensorDictParams, network: TensorDictModule, batch: TensorDictBase) -> Tensor:
+    """Logits ``[S, M, A, T, V]`` of a network under some parameters of its kind; the batch stays as it is."""
+    with parameters.to_module(network):
+        return network(batch.copy())[LOGITS]
 
 
 def masked_mean(value: Tensor, mask: Tensor) -> Tensor:

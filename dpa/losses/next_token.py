@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictParams, dispatch
+from torch import Tensor
 from torchrl.objectives import LossModule
 
-from dpa.losses.network import CONTEXT, LOGITS, masked_mean, token_entropy
+from dpa.losses.network import CONTEXT, logits_under, masked_mean, token_entropy
 from envs import keys
 
 
 class NextTokenLoss(LossModule):
     """Negative log-likelihood of tokens, per valid token [nats] (eq. 1).
 
-    Pre-training reads the tokens of logs; SFT-best reads those of the best rollouts as new labels. Nothing else
-    differs.
+    Pre-training reads the tokens of logs; SFT-best those of the best rollouts as new labels
+    (:class:`~dpa.losses.ImitationLoss`).
 
     Args:
         actor_network: from :func:`~dpa.losses.token_network`.
@@ -70,12 +72,14 @@ class NextTokenLoss(LossModule):
     sides = "targets"
     """It imitates one side; see :attr:`~dpa.losses.PreferenceLoss.sides`."""
     out_keys = ["loss_next_token", "accuracy", "entropy"]
+    keeps_reference: ClassVar[bool] = False
+    """Whether a frozen copy of the network, as it is when the loss is made, is kept."""
 
     def __init__(self, actor_network: TensorDictModule, *, label_smoothing: float = 0.0) -> None:
         super().__init__()
         if not 0 <= label_smoothing < 1:
             raise ValueError(f"label_smoothing must lie in [0, 1), got {label_smoothing}.")
-        self.convert_to_functional(actor_network, "actor_network", create_target_params=False)
+        self.convert_to_functional(actor_network, "actor_network", create_target_params=self.keeps_reference)
         self.label_smoothing = label_smoothing
 
     @property
@@ -96,8 +100,7 @@ class NextTokenLoss(LossModule):
             {CONTEXT: tensordict[accepted.context], keys.TOKENS: tokens, keys.TOKEN_VALID: valid},
             batch_size=tokens.shape[:1],
         )
-        with self.actor_network_params.to_module(self.actor_network):
-            logits = self.actor_network(batch)[LOGITS]
+        logits = logits_under(self.actor_network_params, self.actor_network, batch)
         log_probs, labels = logits.log_softmax(-1), tensordict[accepted.labels]
         nll = -log_probs.gather(-1, labels[..., None])[..., 0]
         spread = -log_probs.mean(-1)
@@ -106,4 +109,9 @@ class NextTokenLoss(LossModule):
             hit = (logits.argmax(-1) == labels).to(logits.dtype)
             entropy = masked_mean(token_entropy(logits), valid)
             diagnostics = {"accuracy": masked_mean(hit, valid), "entropy": entropy}
+            diagnostics |= self._diagnostics(batch, logits)
         return TensorDict({"loss_next_token": loss, **diagnostics}, batch_size=[])
+
+    def _diagnostics(self, batch: TensorDict, logits: Tensor) -> dict[str, Tensor]:
+        """What a subclass logs as well."""
+        return {}

@@ -12,7 +12,14 @@ from tensordict.nn import TensorDictModule, TensorDictParams, dispatch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from dpa.losses.network import CONTEXT, LOGITS, scene_mean, token_divergence, token_entropy, token_log_prob
+from dpa.losses.network import (
+    CONTEXT,
+    logits_under,
+    scene_mean,
+    token_divergence,
+    token_entropy,
+    token_log_prob,
+)
 from envs import keys
 
 Reduction = Literal["sum", "agent_mean", "token_mean"]
@@ -220,9 +227,9 @@ class PreferenceLoss(LossModule):
             {CONTEXT: tensordict[accepted.context], keys.TOKENS: tokens, keys.TOKEN_VALID: valid},
             batch_size=tokens.shape[:1],
         )
-        logits = self._logits(batch, self.actor_network_params)
+        logits = logits_under(self.actor_network_params, self.actor_network, batch)
         with torch.no_grad():
-            reference = self._logits(batch, self.target_actor_network_params)
+            reference = logits_under(self.target_actor_network_params, self.actor_network, batch)
             drift = token_divergence(logits, reference)
         log_prob = token_log_prob(logits, tokens)
         gain = log_prob - token_log_prob(reference, tokens) if self.reference else log_prob
@@ -238,11 +245,6 @@ class PreferenceLoss(LossModule):
             out |= {"nll_unpreferred": nll_unpreferred.detach(), "entropy": scene_mean(token_entropy(logits), valid)}
             out |= {"kl": scene_mean(drift, valid)}
         return TensorDict(out, batch_size=[])
-
-    def _logits(self, batch: TensorDict, parameters: TensorDictParams) -> Tensor:
-        """``[S, M + N, A, T, V]``."""
-        with parameters.to_module(self.actor_network):
-            return self.actor_network(batch.copy())[LOGITS]
 
     def _pair_accuracy(self, preferred: Tensor, unpreferred: Tensor, valid: Tensor) -> Tensor:
         one, other = (reduce_tokens(side, valid, "sum") for side in (preferred, unpreferred))

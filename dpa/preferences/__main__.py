@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 
 from dpa.preferences.card import data_card
 from dpa.preferences.store import PreferenceStore, verify
-from envs.shards import write_bytes
+from envs.files import write_json
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -36,7 +35,7 @@ def _info(folder: Path, pairs: int | None, json_file: Path | None) -> int:
     card = data_card(PreferenceStore(folder), pairs)
     sys.stdout.write(f"{card}\n")
     if json_file is not None:
-        write_bytes(json_file, (json.dumps(card.to_json(), indent=1, allow_nan=False) + "\n").encode())
+        write_json(json_file, card.to_json())
     return 0
 
 

@@ -19,12 +19,11 @@ from dpa.preferences.chunk import PREFIX, PackedGroup, chunk_content, chunk_file
 from dpa.preferences.codec import encode
 from dpa.preferences.group import Group, take_groups
 from dpa.preferences.provenance import METADATA_FILE, Provenance, StoreError
+from envs.files import PARTIAL_PREFIX, sync
 
 LOCK_SECONDS = 300.0
 """A chunk is written in far less than a second; who holds the lock for longer has lost its file system."""
 LOCK_FILE = ".lock"
-PARTIAL_PREFIX = ".partial-"
-"""Files that are being written. They are made under the lock only, so whoever holds it may remove all others."""
 
 
 class PreferenceWriter:
@@ -214,8 +213,4 @@ def _put(file: IO[bytes], content: bytes, path: Path) -> None:
     file.flush()
     os.fsync(file.fileno())
     os.replace(file.name, path)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    sync(path.parent)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import torch
@@ -216,8 +217,15 @@ def realism_of_groups(
 
 
 def _opened(config: str | Path | RealismConfig, quirks: bool) -> RealismConfig:
-    config = config if isinstance(config, RealismConfig) else RealismConfig.load(config)
+    if not isinstance(config, RealismConfig):
+        config = RealismConfig.load(config) if str(config).endswith(".yaml") else _of_year(str(config))
     return config if quirks else config.replace(quirks=frozenset())
+
+
+@cache
+def _of_year(name: str) -> RealismConfig:
+    """A configuration of ours, read once: a file of a user's may change meanwhile, and these do not."""
+    return RealismConfig.load(name)
 
 
 def _batches(comparisons: list[Comparison], budget: float) -> Iterator[list[Comparison]]:

@@ -8,7 +8,6 @@ names of the official outputs.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 import warnings
@@ -24,6 +23,7 @@ from scipy.stats import bootstrap
 from dpa.realism.config import RealismConfig
 from dpa.realism.files import Scenarios, read_rollouts
 from dpa.realism.metric import RealismResult, mean_result, realism
+from envs.files import write_json
 from envs.progress import progress
 
 STANDARD_ROLLOUTS = 32
@@ -136,11 +136,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     content = {"config": options.config, "quirks": not options.no_quirks} | report(results)
     _print(content)
     if options.json is not None:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        part = options.json.with_name(f".{options.json.name}.part")
         # a figure that is not defined is NaN here as in the official outputs; JSON has null for it
-        part.write_text(json.dumps(_without_nan(content), indent=1) + "\n", encoding="utf-8")
-        part.replace(options.json)
+        write_json(options.json, _without_nan(content))
     return 0
 
 

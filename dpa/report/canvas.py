@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+
+from envs.files import whole
 
 INK, QUIET, RULE = "#3c4043", "#8b9096", "#e3e5e8"
 POSITIVE, NEGATIVE, NEUTRAL = "#2a78b5", "#d55e00", "#8b9096"
@@ -42,6 +43,5 @@ def save_figure(figure: Figure, path: str | Path) -> None:
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise ValueError(f"a figure must end in .png, got {path}.")
-    part = path.with_name(path.name + ".part")
-    figure.savefig(part, format="png", dpi=160)
-    os.replace(part, path)
+    with whole(path) as part:
+        figure.savefig(part, format="png", dpi=160)

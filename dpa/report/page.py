@@ -25,7 +25,7 @@ from dpa.report.sections.origin import study_section
 from dpa.report.sections.rankings import discriminator_section, sensitivity_section, validity_section
 from dpa.report.sections.results import experiment_section
 from dpa.report.study import Evaluations, Study
-from envs.shards import write_bytes
+from envs.files import write_bytes
 
 SHOWS = {"validity": validity_section, "sensitivity": sensitivity_section, "discriminator": discriminator_section}
 

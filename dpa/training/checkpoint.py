@@ -38,6 +38,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from envs.files import PARTIAL_PREFIX, whole
 from envs.options import differences
 
 FORMAT = "dpa-omf/1"
@@ -103,7 +104,7 @@ class Checkpointer:
         if taken:
             raise ValueError(f"the keys {taken} of the state belong to the checkpoint itself; rename them.")
         self.folder.mkdir(parents=True, exist_ok=True)
-        for left_over in self.folder.glob(f".*{SUFFIX}.tmp"):  # of a save that was killed
+        for left_over in self.folder.glob(f"{PARTIAL_PREFIX}*{SUFFIX}"):  # of a save that was killed
             left_over.unlink()
         path = self.folder / f"step_{step:010d}{SUFFIX}"
         _write(path, {**_header("training", self.config), "step": step, **state})
@@ -323,20 +324,8 @@ def _header(kind: str, config: Mapping[str, Any] | None) -> dict[str, Any]:
 def _write(path: Path, payload: dict[str, Any]) -> None:
     """Publish a file whole or not at all, also across a power cut."""
     _check_plain(payload, path.name)
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            torch.save(payload, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)  # the new name itself
-    finally:
-        os.close(folder)
+    with whole(path) as part, part.open("wb") as file:  # a path would put its name into the archive
+        torch.save(payload, file)
 
 
 def _read(path: Path, kind: str) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, TextIO
 
 from dpa.training.exhibits import Picture, Table, as_markdown, as_picture, as_table
+from envs.files import write_bytes
 
 Backend = Literal["csv", "wandb", "tensorboard"]
 MODULES = {"wandb": "wandb", "tensorboard": "tensorboard"}
@@ -151,7 +152,7 @@ class CsvLogger:
     def __init__(self, folder: Path, config: Mapping[str, Any], resume_step: int | None) -> None:
         text = json.dumps(config, indent=2, sort_keys=True)
         folder.mkdir(parents=True, exist_ok=True)
-        _replace_text(folder / "config.json", text + "\n")
+        write_bytes(folder / "config.json", f"{text}\n".encode())
         for path in _curves(folder):
             _drop_rows_after(path, resume_step)
         for path in _exhibits(folder):
@@ -195,7 +196,7 @@ class CsvLogger:
                 return False
             raise ValueError(f"{kind}/{name} of step {step} has been written already; give another name or step.")
         folder.mkdir(parents=True, exist_ok=True)
-        _replace_bytes(folder / f"{step}.{suffix}", content)
+        write_bytes(folder / f"{step}.{suffix}", content)
         return True
 
     def close(self) -> None:
@@ -215,7 +216,7 @@ class _WandbLogger:
 
         id_file = folder / "wandb_id.txt"
         if resume_step is None or not id_file.is_file():
-            _replace_text(id_file, secrets.token_hex(4) + "\n")
+            write_bytes(id_file, f"{secrets.token_hex(4)}\n".encode())
         run_id = id_file.read_text().strip()
         self._run = wandb.init(
             project=project, name=name, id=run_id, resume="allow", dir=folder, config=dict(config), mode=mode
@@ -321,16 +322,6 @@ def _complete_rows(path: Path) -> list[list[str]]:
 def _drop_rows_after(path: Path, step: int | None) -> None:
     rows = [] if step is None else [row for row in _complete_rows(path) if int(row[0]) <= step]
     if rows:
-        _replace_text(path, "".join(f"{row[0]},{row[1]}\n" for row in rows))
+        write_bytes(path, "".join(f"{row[0]},{row[1]}\n" for row in rows).encode())
     else:
         path.unlink()
-
-
-def _replace_text(path: Path, text: str) -> None:
-    _replace_bytes(path, text.encode())
-
-
-def _replace_bytes(path: Path, content: bytes) -> None:
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_bytes(content)
-    os.replace(temporary, path)

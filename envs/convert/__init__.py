@@ -22,10 +22,11 @@ from pathlib import Path
 from envs.convert.describe import write_card
 from envs.convert.plan import Task, digest, make_plan
 from envs.convert.work import make_shards
+from envs.files import PARTIAL_PREFIX
 from envs.options import differences
 from envs.progress import progress
 from envs.scene import SceneError
-from envs.shards import PARTIAL_PREFIX, ShardRecord, file_digest, read_record
+from envs.shards import ShardRecord, file_digest, read_record
 from envs.sources import SOURCES
 from envs.store import MANIFEST_FILE, Manifest, SceneStore, read_manifest, write_manifest
 from envs.workers import run_tasks

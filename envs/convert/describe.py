@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from envs.card import Card, card_text
+from envs.files import write_bytes
 from envs.render.card import draw_card
 from envs.render.save import save_picture
-from envs.shards import read_record, write_bytes
+from envs.shards import read_record
 from envs.store import Manifest, SceneStore
 
 CARD_FILE, CARD_PICTURE = "card.md", "card.png"

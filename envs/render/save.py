@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable
 from itertools import chain
 from pathlib import Path
@@ -12,6 +11,7 @@ from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 from PIL import Image
 
+from envs.files import PARTIAL_PREFIX, whole
 from envs.render.style import AGENT_COLORS, LIGHT_STYLE, SDC_COLOR
 from envs.scene import STEP_SECONDS
 
@@ -44,18 +44,15 @@ def save_picture(path: str | Path, frames: Iterable[Frame], *, frame_seconds: fl
     first = next(frames, None)
     if first is None:
         raise ValueError(f"{path}: no frame to write.")
-    part = path.with_name(path.name + ".part")
-    try:
+    with whole(path) as part:
         write(part, chain([first], frames), frame_seconds)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _write_png(part: Path, frames: Iterable[Frame], _: float) -> None:
     first, *others = frames
     if others:
-        raise ValueError(f"{part.stem}: {1 + len(others)} frames; a PNG holds exactly one, a GIF or MP4 one or more.")
+        name = part.name.removeprefix(PARTIAL_PREFIX)
+        raise ValueError(f"{name}: {1 + len(others)} frames; a PNG holds exactly one, a GIF or MP4 one or more.")
     Image.fromarray(first).save(part, format="PNG", optimize=True)
 
 

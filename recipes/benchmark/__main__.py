@@ -17,8 +17,8 @@ from pathlib import Path
 
 import torch
 
+from envs.files import write_json
 from recipes.benchmark import realism, rollout, scenes, transport
-from recipes.cli import write_json
 
 PARTS = {
     "realism": (realism, "seconds of the realism metric per scene"),

@@ -23,13 +23,14 @@ from dpa.training.checkpoint import load_policy
 from dpa.training.loggers import read_curve
 from envs.scene import Scene
 from envs.sources.synthetic import straight_road
-from recipes import adversary, discriminator
-from recipes.adversary import best_look, fit, measured_on
-from recipes.cli import CONFIG
-from recipes.models import build_policy, policy_config, write_policy
-from recipes.motions import Motions, MotionShelf, Sight, driven_log
-from recipes.rolled import Rolled
-from recipes.spurious import QUANTITIES, RANKINGS, Ranked, partial, summarise
+from recipes import discriminator
+from recipes.common.cli import CONFIG
+from recipes.common.models import build_policy, policy_config, write_policy
+from recipes.common.rolled import Rolled
+from recipes.studies import adversary
+from recipes.studies.adversary import best_look, fit, measured_on
+from recipes.studies.motions import Motions, MotionShelf, Sight, driven_log
+from recipes.studies.spurious import QUANTITIES, RANKINGS, Ranked, partial, summarise
 
 SMALL = ["num_rollouts=8", "memory=0.001", "training.num_rollouts=3", "training.steps=6", "training.look_interval=2"]
 SMALL += ["training.checkpoint_interval=2", "training.width=8", "training.held_out=0.3", "training.batch_scenes=2"]

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from dpa.policy import ContextOptions, MotionLM, SceneContext, make_context
 from dpa.tokens import VerletTokenizer
 from envs.sources.synthetic import straight_road
-from recipes.likelihoods import Probe, divergence, probe
+from recipes.alignment.likelihoods import Probe, divergence, probe
 
 V = 4
 

@@ -11,7 +11,7 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 from tensorboard.backend.event_processing.plugin_event_accumulator import EventAccumulator
 
-from recipes.logged import log_experiment
+from recipes.experiment.logged import log_experiment
 from tests.dpa.report.runs import write_runs
 
 

@@ -13,15 +13,16 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from dpa.policy import Decoding
-from recipes.check import check_experiment
-from recipes.cli import CONFIG, write_json
+from envs.files import write_json
+from recipes.common.cli import CONFIG
 from recipes.compare import choose, snapshots_of
-from recipes.jobs import runs_of
-from recipes.methods import read_setups
-from recipes.pool import Workers
-from recipes.runs import Run
-from recipes.stages import Stages, alone_in, read_account
-from recipes.summary import budget
+from recipes.experiment.check import check_experiment
+from recipes.experiment.jobs import runs_of
+from recipes.experiment.methods import read_setups
+from recipes.experiment.pool import Workers
+from recipes.experiment.runs import Run
+from recipes.experiment.stages import Stages, alone_in, read_account
+from recipes.experiment.summary import budget
 
 EXPERIMENTS = sorted(path.stem for path in (Path(CONFIG["config_path"]) / "experiment").glob("*.yaml"))
 FURTHER = "+experiment.setup.dpa_omf={start:dpa_adef}"

@@ -14,9 +14,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from dpa.ranking import PreferenceDistance
 from dpa.tokens import VerletTokenizer
-from recipes.cli import CONFIG, build, finished, recipe, write_json
-from recipes.models import TOKENIZERS, build_policy, policy_config
-from recipes.scenes import open_splits
+from envs.files import write_json
+from recipes.common.cli import CONFIG, build, finished, recipe
+from recipes.common.models import TOKENIZERS, build_policy, policy_config
+from recipes.common.scenes import open_splits
 
 RECIPES = ("pretrain", "collect", "align", "evaluate", "play", "ladder", "tokens", "compare", "validity", "sensitivity")
 WITHOUT_POLICY = ("pretrain", "ladder", "tokens", "compare", "play", "validity", "sensitivity")

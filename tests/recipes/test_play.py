@@ -16,9 +16,9 @@ from dpa.report.player import PlayerScene, pack_players
 from dpa.rollout import make_collector
 from envs import keys
 from envs.store import SceneStore
-from recipes.models import open_policy
+from recipes.common.models import open_policy
+from recipes.common.rolled import rolled
 from recipes.play import log_likelihood, roll_out
-from recipes.rolled import rolled
 
 K, DISTANCE = 12, PreferenceDistance(stride=5)
 

@@ -17,6 +17,7 @@ import torch
 
 from dpa.training.checkpoint import load_policy
 from dpa.training.loggers import read_curve
+from envs.files import PARTIAL_PREFIX
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 SECONDS = 240
@@ -95,7 +96,7 @@ def assert_same(mine: Path, other: Path, curves: tuple[str, ...]) -> None:
     ours, theirs = (load_policy(folder / "policy.pt")[0] for folder in (mine, other))
     for name, value in ours.items():
         torch.testing.assert_close(value, theirs[name], atol=1e-3, rtol=1e-3)
-    assert not [path for path in mine.rglob("*") if path.name.endswith((".tmp", ".part"))]
+    assert not [path for path in mine.rglob("*") if path.name.startswith(PARTIAL_PREFIX)]
     options = [json.loads((folder / "result.json").read_text())["options"] for folder in (mine, other)]
     assert options[0] == options[1], "the number of ranks is no option of the run"
 
@@ -203,7 +204,7 @@ def test_the_end_of_one_rank_is_the_end_of_all(options: Callable, runs: Path, tm
         assert process.wait(timeout=60) != 0
         assert not Path(f"/proc/{first}").exists()
     assert not (tmp_path / "pretrain/policy.pt").exists()
-    left = [path.name for path in (tmp_path / "pretrain").rglob("*") if path.name.endswith((".tmp", ".part"))]
+    left = [path.name for path in (tmp_path / "pretrain").rglob("*") if path.name.startswith(PARTIAL_PREFIX)]
     assert not left
 
 

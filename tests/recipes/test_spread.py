@@ -13,8 +13,8 @@ from omegaconf import OmegaConf
 from dpa.ranking import PreferenceDistance
 from dpa.ranking.features import feature_names, log_trajectory
 from envs.sources.synthetic import straight_road
-from recipes.cli import build
-from recipes.rolled import Rolled
+from recipes.common.cli import build
+from recipes.common.rolled import Rolled
 from recipes.spread import spreads
 
 

@@ -32,16 +32,16 @@ from envs.scene import CURRENT_STEP
 from envs.sources.synthetic import straight_road
 from envs.store import SceneStore
 from recipes import evaluate as evaluation
-from recipes.candidates import Group, make_candidates
-from recipes.cli import CONFIG, plain
-from recipes.draws import draw_rows, make_batch, parts_of
+from recipes.alignment.candidates import Group, make_candidates
+from recipes.alignment.draws import draw_rows, make_batch, parts_of
+from recipes.alignment.losses import check_fit, make_loss
+from recipes.common.cli import CONFIG, plain
+from recipes.common.models import open_policy
+from recipes.common.partial import PartialResult
+from recipes.common.rolled import Rolled
+from recipes.common.scenes import open_splits
 from recipes.evaluate import SCENE_FIGURES, final_spread, standing_moved
-from recipes.losses import check_fit, make_loss
-from recipes.models import open_policy
-from recipes.partial import PartialResult
-from recipes.pool import Job, Workers
-from recipes.rolled import Rolled
-from recipes.scenes import open_splits
+from recipes.experiment.pool import Job, Workers
 
 METHODS = ("dpa_omf", "dpa_adef", "sft_best_oa", "sft_best_ade", "adversarial_afd")
 

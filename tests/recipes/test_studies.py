@@ -14,8 +14,8 @@ from hydra import compose, initialize_config_dir
 
 from dpa.realism import realism
 from recipes import validity
-from recipes.cli import CONFIG
-from recipes.models import build_policy, policy_config, write_policy
+from recipes.common.cli import CONFIG
+from recipes.common.models import build_policy, policy_config, write_policy
 from recipes.sensitivity import Variants
 from recipes.sensitivity import summarise as summarise_variants
 from recipes.validity import compare_with, summarise, windows

@@ -22,9 +22,9 @@ from dpa.realism.submission.messages import CorruptError, SubmissionError
 from dpa.realism.submission.metadata import metadata_faults, read_fields
 from dpa.realism.submission.reader import check_exists, damage_told, entries
 from dpa.realism.submission.validate import Present, PresentOf, find_faults
+from envs.files import write_json
 from envs.progress import progress
 from envs.scene import CURRENT_STEP
-from envs.shards import write_json
 from envs.sources.scenario import Scenario
 from envs.sources.womd import WOMD, payloads
 from envs.store import MANIFEST_FILE, SceneStore

@@ -28,10 +28,10 @@ from dpa.realism.submission import wire
 from dpa.realism.submission.convert import encode_rollouts, present_ids
 from dpa.realism.submission.messages import NUM_ROLLOUTS, CorruptError, ScenarioRollouts, SubmissionError
 from dpa.realism.submission.metadata import Metadata
+from envs.files import sync, whole, write_json
 from envs.options import differences
 from envs.progress import progress
 from envs.scene import Scene
-from envs.shards import write_json
 
 SHARD_SCENARIOS = 300
 """Scenarios of a shard if nothing else is asked for: 1.6 GB where each has 128 agents; 150 shards of the test split."""
@@ -169,17 +169,9 @@ class SubmissionWriter:
                 f"{self.path}: {len(missing)} of {len(self._scene_ids)} scenes have no rollouts yet, the first is "
                 f"{missing[0]!r}; add them all."
             )
-        part = self.path.with_name(f".{self.path.name}.part")
-        try:
-            with part.open("wb") as file:
-                self._pack(file)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(part, self.path)
-        finally:
-            part.unlink(missing_ok=True)
+        with whole(self.path) as part, part.open("wb") as file:
+            self._pack(file)
         write_json(self._card_path, self._card)
-        _sync_folder(self.path.parent)
         self.finished = True
         self.close()
         shutil.rmtree(self._folder)
@@ -221,7 +213,7 @@ class SubmissionWriter:
                 _check_same(self._folder, json.loads(options.read_text(encoding="utf-8")), self._options)
             else:
                 write_json(options, self._options)
-                _sync_folder(self._folder)
+                sync(self._folder)
             end = self._read_journal()
         except BaseException:
             self._journal.close()
@@ -372,11 +364,3 @@ def _check_rules(scene: Scene, poses: Tensor, controlled: Tensor | None) -> None
 def _check_same(where: Path, there: Mapping[str, Any], here: Mapping[str, Any]) -> None:
     if differ := differences(there, here):
         raise SubmissionError(f"{where} was written with other options ({differ}); remove it, or name another file.")
-
-
-def _sync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

@@ -17,9 +17,9 @@ from dpa.report.statistics import paired_bootstrap
 from envs.sources.synthetic import straight_road
 from recipes import discriminator as discriminator_recipe
 from recipes import sensitivity as sensitivity_recipe
-from recipes import spurious
 from recipes import validity as validity_recipe
-from recipes.study import as_json, how_made
+from recipes.studies import spurious
+from recipes.studies.study import as_json, how_made
 from tests.dpa.report.made_rollouts import judged, slower
 
 SEEDS = (0, 1, 2)
@@ -110,7 +110,7 @@ def write_experiment(
 
 
 def label(method: str) -> str:
-    """A snapshot's has its step, as recipes.summary writes it."""
+    """A snapshot's has its step, as recipes.experiment.summary writes it."""
     base, _, step = method.partition("@")
     return LABELS[base] + (f" @ {step}" if step else "")
 

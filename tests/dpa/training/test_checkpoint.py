@@ -25,6 +25,7 @@ from dpa.training.checkpoint import (
 )
 from dpa.training.optim import clip_and_step, make_optimizer, make_schedule
 from dpa.training.seeding import seed_everything
+from envs.files import PARTIAL_PREFIX
 from envs.seeding import make_generator
 
 CONFIG = {"width": 8, "layers": [8, 8]}
@@ -124,7 +125,7 @@ def test_a_kill_during_a_save_leaves_a_whole_checkpoint(tmp_path: Path) -> None:
     with process:
         for _ in range(3):
             process.stdout.readline()
-        while not list(tmp_path.glob(".*.tmp")):  # a save has begun and has not ended
+        while not list(tmp_path.glob(f"{PARTIAL_PREFIX}*")):  # a save has begun and has not ended
             time.sleep(0.0005)
         process.send_signal(signal.SIGKILL)
     saved = Checkpointer(tmp_path).latest()

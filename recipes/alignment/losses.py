@@ -7,20 +7,20 @@ from torchrl.objectives import LossModule
 
 from dpa.losses import (
     ContrastivePreferenceLoss,
+    ImitationLoss,
     KahnemanTverskyLoss,
-    NextTokenLoss,
     PlackettLuceLoss,
     token_network,
 )
 from dpa.policy import MotionLM
-from recipes.candidates import SIDES
-from recipes.cli import build
+from recipes.alignment.candidates import SIDES
+from recipes.common.cli import build
 
 LOSSES: dict[str, type[LossModule]] = {
     "contrastive": ContrastivePreferenceLoss,
     "kahneman_tversky": KahnemanTverskyLoss,
     "plackett_luce": PlackettLuceLoss,
-    "next_token": NextTokenLoss,
+    "next_token": ImitationLoss,
 }
 """Losses that a method's YAML can name."""
 FITS = {"pairs": ("pairs",), "sets": ("pairs", "sets"), "ranking": ("ranking",), "targets": ("targets",)}

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dpa.ranking.agreement import rank_correlation
 from dpa.report.statistics import Interval, paired_bootstrap, summary
-from recipes.study import over_scenes
+from recipes.studies.study import over_scenes
 
 QUANTITIES = {
     "jerk": "mean squared jerk, 10 Hz",

@@ -11,8 +11,8 @@ from omegaconf import DictConfig
 
 from dpa.policy import ContextOptions, MotionLM
 from envs.store import SceneStore
-from recipes.likelihoods import PROBED, make_probes, probe
-from recipes.rankings import open_ranked_scenes
+from recipes.alignment.likelihoods import PROBED, make_probes, probe
+from recipes.common.rankings import open_ranked_scenes
 
 
 class Watch(NamedTuple):

@@ -17,9 +17,9 @@ from dpa.policy import ContextOptions, make_context
 from dpa.ranking.features import feature_names
 from dpa.rollout import lifted
 from dpa.tokens import MotionTokenizer
+from envs.files import PARTIAL_PREFIX, whole, write_json
 from envs.scene import CURRENT_STEP, Scene
-from recipes.cli import write_json
-from recipes.rolled import Rolled
+from recipes.common.rolled import Rolled
 
 
 class Motions(NamedTuple):
@@ -138,10 +138,8 @@ class MotionShelf:
 
     def put(self, scene: int, motions: Motions) -> None:
         """Keep the motions of a scene."""
-        part = self.folder / f".{scene}.part"
-        with part.open("wb") as file:
+        with whole(self.folder / f"{scene}.npz") as part, part.open("wb") as file:
             np.savez(file, **{name: _small(value).numpy() for name, value in motions._asdict().items()})
-        part.replace(self.folder / f"{scene}.npz")
 
     def get(self, scene: int) -> Motions:
         """Read the motions of a scene."""
@@ -152,7 +150,7 @@ class MotionShelf:
     def remove(self) -> None:
         """Remove all that is kept, and the folder."""
         self._options.unlink(missing_ok=True)
-        for path in (*self.folder.glob("[0-9]*.npz"), *self.folder.glob(".*.part")):
+        for path in (*self.folder.glob("[0-9]*.npz"), *self.folder.glob(f"{PARTIAL_PREFIX}*")):
             path.unlink()
         if self.folder.is_dir():
             self.folder.rmdir()

@@ -6,6 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from envs.files import write_bytes
+
 
 class PartialResult:
     """JSON lines ``[scene index, entry]`` after a first line with the options; removed once the result is written.
@@ -36,9 +38,7 @@ class PartialResult:
         same = lines[:1] == [self._options]
         whole = [line for line in lines[1:] if line.endswith("\n")] if same else []
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        part = self.path.with_name(f"{self.path.name}.part")
-        part.write_text("".join([self._options, *whole]), encoding="utf-8")
-        part.replace(self.path)
+        write_bytes(self.path, "".join([self._options, *whole]).encode())
         return dict(map(json.loads, whole))
 
     def add(self, entries: dict[int, dict[str, Any]]) -> None:

@@ -10,12 +10,12 @@ from dpa.realism.config import RealismConfig
 from dpa.report.experiment import REPORTED
 from dpa.tokens import VerletTokenizer
 from dpa.training.loggers import check_backend
-from recipes.candidates import check_data
-from recipes.cli import check_steps, told_of
-from recipes.losses import check_fit, make_loss
-from recipes.methods import read_setups
-from recipes.models import policy_config
-from recipes.rankings import build_distance
+from recipes.alignment.candidates import check_data
+from recipes.alignment.losses import check_fit, make_loss
+from recipes.common.cli import check_steps, told_of
+from recipes.common.models import policy_config
+from recipes.common.rankings import build_distance
+from recipes.experiment.methods import read_setups
 
 CHECKPOINTS = ("last", "select", "all")
 """What becomes of the snapshots of an alignment: there are none, one of them may be chosen, or each is shown."""

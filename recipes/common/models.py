@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 from dpa.policy import SIZES, ContextOptions, MotionLM, MotionLMConfig
 from dpa.tokens import MotionTokenizer, VerletTokenizer
 from dpa.training.checkpoint import load_policy, load_weights, save_policy
-from recipes.cli import build, plain
+from recipes.common.cli import build, plain
 
 TOKENIZERS = {"verlet": VerletTokenizer}
 """Tokenizers that a YAML can name; add a class of your own here (docs/how-to.md)."""

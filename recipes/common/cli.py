@@ -23,7 +23,7 @@ from dpa.training.distributed import started_ranks
 from envs.allocator import keep_freed_memory
 from envs.options import differences
 
-CONFIG = {"version_base": "1.3", "config_path": str(Path(__file__).parent / "config")}
+CONFIG = {"version_base": "1.3", "config_path": str(Path(__file__).parents[1] / "config")}
 """Arguments of ``hydra.main`` that all recipes share; with an absolute path, ``main`` may also be imported."""
 REFUSED_STATUS, INTERRUPTED_STATUS = 2, 130
 GRACE_SECONDS = 10.0
@@ -160,15 +160,6 @@ def build(target: Callable[..., Any], section: DictConfig, name: str, *args: Any
     except TypeError as error:
         raise ValueError(f"{name} {error}.") from None
     return target(*args, **options, **fixed)
-
-
-def write_json(path: str | Path, content: Any) -> None:
-    """Write JSON whole or not at all; a NaN is an error."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    part.replace(path)
 
 
 def finite(value: float) -> float | None:

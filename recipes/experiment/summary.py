@@ -12,14 +12,14 @@ from dpa.policy import Decoding
 from dpa.report.experiment import read_json
 from dpa.report.statistics import compare_methods
 from dpa.report.table import REFERENCE
-from recipes.candidates import SIDES
-from recipes.cli import plain
+from recipes.alignment.candidates import SIDES
+from recipes.alignment.likelihoods import PROBED
+from recipes.common.cli import plain
+from recipes.common.scenes import Splits
 from recipes.evaluate import SCENE_FIGURES, mean_known
-from recipes.jobs import runs_of
-from recipes.likelihoods import PROBED
-from recipes.methods import setup_of
-from recipes.runs import SNAPSHOT, Run, method_of
-from recipes.scenes import Splits
+from recipes.experiment.jobs import runs_of
+from recipes.experiment.methods import setup_of
+from recipes.experiment.runs import SNAPSHOT, Run, method_of
 
 TOLD = ("name", "title", "paper", "question", "headline", "axis", "split", "published")
 """What an experiment says of itself."""

@@ -9,8 +9,8 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from dpa.report.table import REFERENCE
-from recipes.cli import build
-from recipes.runs import SNAPSHOT
+from recipes.common.cli import build
+from recipes.experiment.runs import SNAPSHOT
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from dpa.training.batches import Item, collate_items, micro_batches
 from dpa.training.distributed import ALONE, Ranks
 from envs import keys
-from recipes.candidates import Group
+from recipes.alignment.candidates import Group
 
 
 class Draw(NamedTuple):

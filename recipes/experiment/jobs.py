@@ -15,20 +15,21 @@ from dpa.policy import Decoding
 from dpa.report.table import REFERENCE
 from dpa.training.loggers import read_curve
 from dpa.training.run import SECONDS
+from envs.files import write_json
 from envs.seeding import make_generator
 from recipes.align import align
-from recipes.cli import finished, finite, told_of, write_json
+from recipes.alignment.likelihoods import PROBED, divergence, make_probes, probe
+from recipes.alignment.watch import Watch
 from recipes.collect import collect
+from recipes.common.cli import finished, finite, told_of
+from recipes.common.models import open_policy, weights_digest
+from recipes.common.rankings import TimedDistance, build_distance, open_ranked_scenes
+from recipes.common.scenes import fingerprint, open_splits
 from recipes.evaluate import evaluate, mean_known
-from recipes.likelihoods import PROBED, divergence, make_probes, probe
-from recipes.methods import setup_of
-from recipes.models import open_policy, weights_digest
+from recipes.experiment.methods import setup_of
+from recipes.experiment.runs import Run, RunFolder
 from recipes.pretrain import pretrain
-from recipes.rankings import TimedDistance, build_distance, open_ranked_scenes
 from recipes.rerank import rerank
-from recipes.runs import Run, RunFolder
-from recipes.scenes import fingerprint, open_splits
-from recipes.watch import Watch
 
 
 def pretrain_job(cfg: DictConfig, seed: int) -> dict[str, float]:

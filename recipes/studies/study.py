@@ -13,15 +13,16 @@ from dpa.policy import ContextOptions, Decoding, MotionLM
 from dpa.ranking import Distance
 from dpa.report.statistics import Interval, summary
 from dpa.rollout import make_collector
+from envs.files import write_json
 from envs.progress import progress
 from envs.store import SceneStore
-from recipes.cli import build, finished, plain, write_json
-from recipes.models import open_policy, policies_of, weights_digest
-from recipes.partial import PartialResult
-from recipes.provenance import pasteable
-from recipes.rankings import build_distance
-from recipes.rolled import Rolled, rolled
-from recipes.scenes import fingerprint
+from recipes.common.cli import build, finished, plain
+from recipes.common.models import open_policy, policies_of, weights_digest
+from recipes.common.partial import PartialResult
+from recipes.common.provenance import pasteable
+from recipes.common.rankings import build_distance
+from recipes.common.rolled import Rolled, rolled
+from recipes.common.scenes import fingerprint
 
 Measure = Callable[[Rolled], dict[str, Any]]
 """Numbers of one scene from its rollouts, ready for JSON."""

@@ -9,15 +9,16 @@ from omegaconf import DictConfig
 
 from dpa.report.experiment import read_json
 from dpa.report.player import pack_players
+from envs.files import write_json
 from envs.store import SceneStore
-from recipes.cli import plain, write_json
-from recipes.jobs import runs_of
-from recipes.models import open_policy, weights_digest
+from recipes.common.cli import plain
+from recipes.common.models import open_policy, weights_digest
+from recipes.common.rankings import build_distance
+from recipes.common.scenes import fingerprint
+from recipes.experiment.jobs import runs_of
+from recipes.experiment.runs import Run
+from recipes.experiment.summary import labels
 from recipes.play import roll_out
-from recipes.rankings import build_distance
-from recipes.runs import Run
-from recipes.scenes import fingerprint
-from recipes.summary import labels
 
 
 def write_players(cfg: DictConfig, scenes: SceneStore, chosen: Mapping[str, Run]) -> None:

@@ -17,7 +17,7 @@ from dpa.training.optim import clip_and_step, make_optimizer
 from dpa.training.run import Run
 from dpa.training.seeding import seed_everything
 from envs.seeding import make_generator
-from recipes.motions import Motions, MotionShelf
+from recipes.studies.motions import Motions, MotionShelf
 
 Curve = list[dict[str, float]]
 """One entry for each look: ``step``, ``train_loss``, ``held_out_loss`` [nats], ``held_out_auc``."""

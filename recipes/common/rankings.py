@@ -15,9 +15,9 @@ from dpa.ranking import Distance, PreferenceDistance, Ranking
 from dpa.ranking.rival import DisplacementDistance
 from envs.scene import Scene
 from envs.store import SceneStore
-from recipes.cli import build
-from recipes.models import weights_digest
-from recipes.scenes import fingerprint
+from recipes.common.cli import build
+from recipes.common.models import weights_digest
+from recipes.common.scenes import fingerprint
 
 DISTANCES: dict[str, type[Distance]] = {"preference": PreferenceDistance, "displacement": DisplacementDistance}
 """Distances that a YAML of ``config/ranking`` can name; add a class of your own here (docs/how-to.md)."""

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from dpa.report.experiment import read_json
-from recipes.cli import write_json
-from recipes.pool import Job, Workers
+from envs.files import write_json
+from recipes.experiment.pool import Job, Workers
 
 
 class Stages:

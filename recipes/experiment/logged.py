@@ -13,10 +13,10 @@ from dpa.report.experiment import read_experiment
 from dpa.report.figures import plot_comparison
 from dpa.report.table import REFERENCE, cells, header, summarise
 from dpa.training.loggers import make_logger
-from recipes.cli import plain
+from recipes.alignment.likelihoods import PROBED
+from recipes.common.cli import plain
 from recipes.evaluate import SCENE_FIGURES
-from recipes.jobs import runs_of
-from recipes.likelihoods import PROBED
+from recipes.experiment.jobs import runs_of
 
 
 def log_experiment(cfg: DictConfig, found: Mapping[str, Any]) -> Path:

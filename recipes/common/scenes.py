@@ -14,7 +14,7 @@ from envs.convert import convert
 from envs.seeding import make_generator
 from envs.shards import FORMAT_VERSION
 from envs.store import SceneStore
-from recipes.cli import build
+from recipes.common.cli import build
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,59 @@
+"""Imitation of rollouts as new labels (SFT-best; method.md section 6)."""
+
+from __future__ import annotations
+
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+
+from dpa.losses.network import logits_under, masked_mean, token_divergence
+from dpa.losses.next_token import NextTokenLoss
+from envs import keys
+
+
+class ImitationLoss(NextTokenLoss):
+    """Next-token loss (eq. 1) of a trained policy's best rollouts, and how far the policy has gone from there.
+
+    What is minimised is :class:`~dpa.losses.NextTokenLoss`. A step takes one more pass, without gradients: of a frozen
+    copy of the network as it is when the loss is made.
+
+    Args:
+        actor_network: from :func:`~dpa.losses.token_network`.
+
+    Keyword Args:
+        label_smoothing: share of the target spread over all tokens.
+
+    Returns, besides what :class:`~dpa.losses.NextTokenLoss` does, ``kl``: of the policy from the copy, per valid token,
+    over the vocabulary [nats], detached.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from dpa.losses import token_network
+        >>> from dpa.policy import MotionLM, collate_contexts, make_context
+        >>> from dpa.tokens import VerletTokenizer
+        >>> from envs.sources.synthetic import straight_road
+        >>> loss = ImitationLoss(token_network(MotionLM("nano", VerletTokenizer()).eval()))
+        >>> batch = TensorDict(
+        ...     {
+        ...         "context": collate_contexts([make_context(straight_road(2))]),
+        ...         "tokens": torch.full((1, 1, 2, 16), 84),
+        ...         "token_valid": torch.ones(1, 1, 2, 16, dtype=torch.bool),
+        ...     },
+        ...     batch_size=[1],
+        ... )
+        >>> loss(batch)["kl"].item()  # before the first step
+        0.0
+    """
+
+    keeps_reference = True
+    out_keys = ["loss_next_token", "accuracy", "entropy", "kl"]
+
+    def __init__(self, actor_network: TensorDictModule, *, label_smoothing: float = 0.0) -> None:
+        super().__init__(actor_network, label_smoothing=label_smoothing)
+        # The reference stays as it is: tell torchrl, which warns otherwise, that no updater is missing.
+        self._has_update_associated["actor_network"] = True
+
+    def _diagnostics(self, batch: TensorDict, logits: Tensor) -> dict[str, Tensor]:
+        reference = logits_under(self.target_actor_network_params, self.actor_network, batch)
+        return {"kl": masked_mean(token_divergence(logits, reference), batch[keys.TOKEN_VALID])}

@@ -1,0 +1,1 @@
+"""What every command reads and writes: options, scenes, policies, ranked rollouts, results in parts."""

@@ -1,0 +1,1 @@
+"""What studies of rankings share: numbers of every rollout, and what tells one ranking from another."""
