@@ -4,7 +4,8 @@
 
 RUNS is the folder that recipes.compare fills (its output). OUT is the page: a .html file, or a folder for index.html.
 With a .png it is one picture, the differences of the first experiment; with a .md the tables of all experiments, for a
-document. The numbers are those of the files in RUNS.
+document; with a .zip what the numbers rest on, to hand on: results of every scene, options and curves, without weights,
+scenes and rollouts. Unpacked it is a RUNS again. The numbers are those of the files in RUNS.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from dpa.report.archive import write_archive
 from dpa.report.figures import plot_comparison
 from dpa.report.page import write_study, write_whole
 from dpa.report.study import read_study
@@ -24,11 +26,11 @@ EXPERIMENTS = Path(__file__).parent / "config" / "experiment"
 
 
 def report(runs: Path, out: Path) -> Path:
-    """Write the page of a study, the picture of its first experiment, or its tables.
+    """Write the page of a study, the picture of its first experiment, its tables, or what they rest on.
 
     Args:
         runs: folder of results.
-        out: ``.html``, a folder for ``index.html``, ``.png``, or ``.md``.
+        out: ``.html``, a folder for ``index.html``, ``.png``, ``.md``, or ``.zip``.
 
     Returns:
         The file that was written.
@@ -42,6 +44,8 @@ def report(runs: Path, out: Path) -> Path:
     if out.suffix == ".png":
         plot_comparison(next(iter(study.experiments.values())), out)
         return out
+    if out.suffix == ".zip":
+        return write_archive(out, runs)
     if out.suffix == ".md":
         return write_whole(out, study_text(study))
     page = out if out.suffix == ".html" else out / "index.html"
@@ -59,7 +63,9 @@ def make_parser() -> argparse.ArgumentParser:
         prog="python -m recipes.report", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("runs", metavar="RUNS", type=Path, help="folder of results")
-    parser.add_argument("out", metavar="OUT", type=Path, help="page.html, a folder, picture.png, or tables.md")
+    parser.add_argument(
+        "out", metavar="OUT", type=Path, help="page.html, a folder, picture.png, tables.md, or results.zip"
+    )
     return parser
 
 

@@ -1,0 +1,55 @@
+"""What the numbers of a study rest on, as one file to put beside a paper or a document."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from envs.files import PARTIAL_PREFIX, whole
+
+KEPT = (".json", ".csv")
+"""Endings of files that hold results, options and curves."""
+LEFT_OUT = ("players.json", "checkpoints/*", "preferences_*/*")
+"""Scenes and rollouts: they are large, and the licence of a recording may not let them be handed on."""
+EPOCH = (1980, 1, 1, 0, 0, 0)
+"""Date of every entry, so that equal studies give equal files."""
+
+
+def write_archive(path: Path, folder: Path) -> Path:
+    """Pack the results of a study with the options, curves and scene-by-scene values behind them.
+
+    Unpacked it is a folder of results like the one that it came from: tables, intervals and the page are made from it
+    again, without its scenes to play and its cards of preferences.
+
+    Args:
+        path: ``.zip`` to write; it appears whole or not at all.
+        folder: of the study.
+
+    Returns:
+        ``path``.
+
+    Examples:
+        >>> import tempfile
+        >>> folder = tempfile.TemporaryDirectory()
+        >>> for name in ("stages.json", "policy.pt"):
+        ...     size = Path(folder.name, name).write_text("{}")
+        >>> zipfile.ZipFile(write_archive(Path(folder.name, "study.zip"), Path(folder.name))).namelist()
+        ['stages.json']
+        >>> folder.cleanup()
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
+        for file in files_of(folder):
+            entry = zipfile.ZipInfo(file.relative_to(folder).as_posix(), EPOCH)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            archive.writestr(entry, file.read_bytes())
+    return path
+
+
+def files_of(folder: Path) -> Iterator[Path]:
+    """The files of a study that :func:`write_archive` packs, in order of their names."""
+    for file in sorted(folder.rglob("*")):
+        heavy = any(file.match(pattern) for pattern in LEFT_OUT)
+        if file.is_file() and file.suffix in KEPT and not heavy and not file.name.startswith(PARTIAL_PREFIX):
+            yield file

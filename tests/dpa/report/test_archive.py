@@ -1,0 +1,54 @@
+"""What a study is handed on as: the same numbers, and nothing that is heavy or belongs to others."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from recipes.report import report
+from tests.dpa.report.runs import write_runs
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = write_runs(tmp_path_factory.mktemp("study"))
+    trained = folder / "seed_0" / "dpa_omf"
+    (trained / "checkpoints").mkdir()
+    for file in ("policy.pt", "checkpoints/state.json", ".partial-eval.json"):
+        (trained / file).write_text("{}")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def archive(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return report(runs, tmp_path_factory.mktemp("out") / "new" / "study.zip")
+
+
+def test_tables_made_from_it_are_the_same(runs: Path, archive: Path, tmp_path: Path) -> None:
+    zipfile.ZipFile(archive).extractall(tmp_path / "again")
+    one, other = (report(each, tmp_path / f"{each.name}.md").read_text() for each in (runs, tmp_path / "again"))
+    assert one == other
+
+
+def test_a_page_is_made_from_it(archive: Path, tmp_path: Path) -> None:
+    zipfile.ZipFile(archive).extractall(tmp_path / "again")
+    page = report(tmp_path / "again", tmp_path / "page.html").read_text(encoding="utf-8")
+    for file in (tmp_path / "again" / "experiments").glob("*.json"):
+        assert f'id="experiment-{file.stem}"' in page
+
+
+def test_it_holds_the_values_behind_every_row_and_the_curves_and_neither_weights_nor_scenes(
+    runs: Path, archive: Path
+) -> None:
+    names = set(zipfile.ZipFile(archive).namelist())
+    kept = {file.relative_to(runs).as_posix() for file in runs.rglob("*.csv")} | {"stages.json"}
+    kept |= {file.relative_to(runs).as_posix() for file in runs.glob("seed_*/*/eval_*.json")}
+    assert kept <= names
+    left = {"players.json", *(name for name in names if "preferences_" in name or "checkpoints/" in name)}
+    assert not names & left and all(name.endswith((".json", ".csv")) and ".partial-" not in name for name in names)
+
+
+def test_equal_studies_give_equal_files(runs: Path, archive: Path, tmp_path: Path) -> None:
+    assert report(runs, tmp_path / "again.zip").read_bytes() == archive.read_bytes()
