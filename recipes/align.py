@@ -95,7 +95,7 @@ def align(
     }
     snapshots = {step: folder / f"step_{step}" / "policy.pt" for step in options.snapshots if step <= options.steps}
     if ranks.agree(finished(result, decided_by) is not None and path.is_file(), "finished =", folder):
-        check_kept(snapshots)
+        check_kept(snapshots, options.steps)
         return path
     seed_everything(seed)
     candidates = make_candidates(method.data, store, scenes, context, model.tokenizer.cpu(), seed, played, learnt)
@@ -117,6 +117,7 @@ def align(
         description=method.name,
         ranks=ranks,
     )
+    check_kept(snapshots, run.first_step)
     described = {"method": method.name, "seed": seed, "options": decided_by}
     with run:
         if look is not None and run.first_step == 0:
@@ -135,7 +136,6 @@ def align(
                 run.log(look(device))
             if ranks.main and done in snapshots:
                 write_policy(snapshots[done], model, config, described | {"step": done})
-    check_kept(snapshots)
     if ranks.main:
         write_policy(path, model, config, described)
         last = {name: finite(curve["value"][-1]) for name, curve in read_curves(folder).items()}
@@ -144,14 +144,14 @@ def align(
     return path
 
 
-def check_kept(snapshots: Mapping[int, Path]) -> None:
-    """Refuse to take a run for one that kept other snapshots: they cannot be had any more.
+def check_kept(snapshots: Mapping[int, Path], done: int) -> None:
+    """Refuse to go on with a run that kept other snapshots of the steps done: they cannot be had any more.
 
     Raises:
         ValueError: one is missing.
     """
     for step, path in snapshots.items():
-        if not path.is_file():
+        if step <= done and not path.is_file():
             raise ValueError(
                 f"{path.parent.parent} was trained without a snapshot of step {step}, which alignment.snapshots asks "
                 "for; remove that folder to train it again, or leave the snapshot out."

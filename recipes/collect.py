@@ -67,7 +67,7 @@ def collect(
         policy=weights_digest(model),
         scenes=fingerprint(scenes),
         ranking=distance.describe(),
-        sampling=plain(options.decoding),
+        sampling=plain(options.decoding) | {"precision": options.precision},
         seed=seed,
         num_rollouts=options.num_rollouts,
         horizon=context.horizon,

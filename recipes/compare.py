@@ -47,7 +47,7 @@ from recipes.report import report
 
 
 def compare(cfg: DictConfig) -> dict[str, Any]:
-    """Run every stage of an experiment that is not done yet and write what it found and the page.
+    """Run every stage of an experiment that is not done yet; write what it found and the scenes to play.
 
     Raises:
         ValueError: options that do not fit, before any work.
@@ -60,11 +60,11 @@ def compare(cfg: DictConfig) -> dict[str, Any]:
             train_policies(cfg, stages)
             chosen = choose(cfg, stages)
             measure(cfg, stages, chosen)
-        if cfg.pictures.scenes:
-            write_players(cfg, splits[cfg.experiment.split], chosen.best)
         found = summarise_experiment(cfg, splits, chosen, stages.seconds) | made
         write_json(runs.experiment(cfg.experiment.name), found)
         log_experiment(cfg, found)
+        if cfg.pictures.scenes:
+            write_players(cfg, splits[cfg.experiment.split], chosen.best)
     return found
 
 

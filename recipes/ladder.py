@@ -127,20 +127,20 @@ def driven(
     batches = make_collector(
         scenes,
         model,
-        num_rollouts=cfg.evaluation.num_rollouts,
+        num_rollouts=cfg.num_rollouts,
         decoding=build(Decoding, cfg.decoding, "decoding"),
         options=context,
         seed=cfg.seed,
-        memory=cfg.evaluation.memory,
+        memory=cfg.memory,
         device=cfg.device,
     )
-    for each in rolled(batches, scenes, cfg.evaluation.num_rollouts):
+    for each in rolled(batches, scenes, cfg.num_rollouts):
         yield each.index, each.trajectories
 
 
 def rungs(cfg: DictConfig, scenes: SceneSource) -> Iterator[tuple[str, dict[str, Any], Iterator[tuple[int, Tensor]]]]:
     """Name, what decides it, and rollouts of each rung, from the best to expect to the worst."""
-    count, seed = cfg.evaluation.num_rollouts, cfg.seed
+    count, seed = cfg.num_rollouts, cfg.seed
     config = policy_config(cfg.model)
     seed_everything(seed)
     untrained = build_policy(config)
@@ -164,7 +164,7 @@ def rungs(cfg: DictConfig, scenes: SceneSource) -> Iterator[tuple[str, dict[str,
 
 def climb(cfg: DictConfig, scenes: SceneSource) -> dict[str, dict]:
     """Score every rung, or read it back; ``{rung: {year: {figure: one value per scene}}}``."""
-    common = {"scenes": fingerprint(scenes), "num_rollouts": cfg.evaluation.num_rollouts, "seed": cfg.seed}
+    common = {"scenes": fingerprint(scenes), "num_rollouts": cfg.num_rollouts, "seed": cfg.seed}
     ladder = {}
     for name, own, rollouts in rungs(cfg, scenes):
         path = Path(cfg.output) / f"{name.replace(' ', '_').replace('/', '_')}.json"

@@ -33,9 +33,12 @@ from envs.loader import SceneLoader
 from envs.progress import progress
 from envs.scene import SceneSource
 from envs.seeding import make_generator
-from recipes.common.cli import CONFIG, build, check_steps, finished, plain, ranked_recipe
+from recipes.common.cli import CONFIG, build, check_steps, deciding, finished, ranked_recipe
 from recipes.common.models import build_policy, context_options, policy_config, write_policy
 from recipes.common.scenes import Splits, fingerprint, open_splits
+
+OBSERVING = ("checkpoint_interval", "max_rows", "workers")
+"""Options of the section ``pretraining`` that change nothing about the policy."""
 
 
 def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path, ranks: Ranks = ALONE) -> Path:
@@ -56,7 +59,13 @@ def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path, ranks: Ra
     """
     path, result, options = folder / "policy.pt", folder / "result.json", cfg.pretraining
     config = policy_config(cfg.model)
-    decided_by = {"policy": config, "pretraining": plain(options), "seed": seed, "scenes": fingerprint(splits.train)}
+    decided_by = {
+        "policy": config,
+        "pretraining": deciding(options, *OBSERVING),
+        "seed": seed,
+        "scenes": fingerprint(splits.train),
+        "tuning_scenes": fingerprint(splits.tune),
+    }
     if ranks.agree(finished(result, decided_by) is not None and path.is_file(), "finished =", folder):
         return path
     seed_everything(seed)

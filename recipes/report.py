@@ -23,6 +23,8 @@ from recipes.common.cli import refused
 
 EXPERIMENTS = Path(__file__).parent / "config" / "experiment"
 """One YAML for each experiment that recipes.compare knows."""
+KINDS = (".html", ".png", ".md", ".zip")
+"""What a study is written as."""
 
 
 def report(runs: Path, out: Path) -> Path:
@@ -36,11 +38,14 @@ def report(runs: Path, out: Path) -> Path:
         The file that was written.
 
     Raises:
-        ValueError: no results in ``runs``, or a file of it that cannot be read; the message names it.
+        ValueError: no results in ``runs``, a file of it that cannot be read, or another ending; the message names it.
     """
     study = read_study(runs)
     if out.suffix in (".png", ".md") and not study.experiments:
         raise ValueError(f"{runs} holds no experiments/*.json, and {out.name} would show nothing else; say page.html.")
+    if out.suffix not in ("", *KINDS):
+        raise ValueError(f"{out} must end in one of {', '.join(KINDS)}, or be a folder.")
+    out.parent.mkdir(parents=True, exist_ok=True)
     if out.suffix == ".png":
         plot_comparison(next(iter(study.experiments.values())), out)
         return out

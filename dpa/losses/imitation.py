@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-from dpa.losses.network import logits_under, masked_mean, token_divergence
+from dpa.losses.network import logits_under, scene_mean, token_divergence
 from dpa.losses.next_token import NextTokenLoss
 from envs import keys
 
@@ -24,7 +24,7 @@ class ImitationLoss(NextTokenLoss):
         label_smoothing: share of the target spread over all tokens.
 
     Returns, besides what :class:`~dpa.losses.NextTokenLoss` does, ``kl``: of the policy from the copy, per valid token,
-    over the vocabulary [nats], detached.
+    over the vocabulary, the mean over scenes [nats], detached.
 
     Examples:
         >>> import torch
@@ -56,4 +56,4 @@ class ImitationLoss(NextTokenLoss):
 
     def _diagnostics(self, batch: TensorDict, logits: Tensor) -> dict[str, Tensor]:
         reference = logits_under(self.target_actor_network_params, self.actor_network, batch)
-        return {"kl": masked_mean(token_divergence(logits, reference), batch[keys.TOKEN_VALID])}
+        return {"kl": scene_mean(token_divergence(logits, reference), batch[keys.TOKEN_VALID])}

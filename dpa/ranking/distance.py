@@ -129,6 +129,8 @@ class PreferenceDistance:
 
     def __post_init__(self) -> None:
         names = feature_names(self.features)
+        if self.stride < 1:
+            raise ValueError(f"stride must be 1 or more steps, got {self.stride}.")
         feature_weights(names, self.weights)
         feature_clips(names, self.clips)
         make_solver(self.method, **self.solver)

@@ -5,7 +5,7 @@ knows a policy or an environment. A study is a folder RUNS::
 
     experiments/<name>.json      what an experiment found: dpa.report.experiment.read_experiment
     seed_<n>/<method>/           scalars of a training run, and the evaluations behind the rows
-    seed_<n>/preferences_*/      ranked rollouts of the reference of a seed
+    seed_<n>/preferences_*/      ranked rollouts of the policies of a seed
     stages.json                  seconds and jobs of each stage
     players.json                 scenes and rollouts to play: dpa.report.player.pack_players
     validity/, sensitivity/, discriminator/    summary.json of a study of rankings

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Iterator
+from fnmatch import fnmatch
 from pathlib import Path
 
 from envs.files import PARTIAL_PREFIX, whole
 
 KEPT = (".json", ".csv")
 """Endings of files that hold results, options and curves."""
-LEFT_OUT = ("players.json", "checkpoints/*", "preferences_*/*")
-"""Scenes and rollouts: they are large, and the licence of a recording may not let them be handed on."""
+LEFT_OUT = ("checkpoints", "preferences_*", "players.json", "wandb", "tensorboard")
+"""Names of what stays out: scenes and rollouts are large, and the licence of a recording may not let them be handed
+on; files of loggers tell of the machine."""
 EPOCH = (1980, 1, 1, 0, 0, 0)
 """Date of every entry, so that equal studies give equal files."""
 
@@ -50,6 +52,7 @@ def write_archive(path: Path, folder: Path) -> Path:
 def files_of(folder: Path) -> Iterator[Path]:
     """The files of a study that :func:`write_archive` packs, in order of their names."""
     for file in sorted(folder.rglob("*")):
-        heavy = any(file.match(pattern) for pattern in LEFT_OUT)
-        if file.is_file() and file.suffix in KEPT and not heavy and not file.name.startswith(PARTIAL_PREFIX):
+        names = file.relative_to(folder).parts
+        left_out = any(fnmatch(name, pattern) for name in names for pattern in (*LEFT_OUT, f"{PARTIAL_PREFIX}*"))
+        if file.is_file() and file.suffix in KEPT and not left_out:
             yield file

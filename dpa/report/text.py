@@ -100,7 +100,7 @@ def _made(experiment: Experiment) -> str:
         f"{scenes['train']} training, {scenes['tune']} tuning and {scenes['eval']} evaluation scenes of "
         f"{scenes['source']}; numbers are of the {experiment.reported}; seeds {', '.join(map(str, experiment.seeds))}; "
         f"realism of {experiment.metric}; {experiment.date[:10] or MISSING}, commit "
-        f"{(experiment.revision or MISSING)[:10]}; {experiment.machine}; {duration(experiment.worker_seconds)} of one "
+        f"{experiment.revision or MISSING}; {experiment.machine}; {duration(experiment.worker_seconds)} of one "
         "worker. Differences are paired by scene and seed, with 95 % intervals over both."
     )
 

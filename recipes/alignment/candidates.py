@@ -108,8 +108,8 @@ def make_candidates(
         Scenes that no pair is left of, or no token, are not among them.
 
     Raises:
-        ValueError: an unknown kind, ranking or way to pair, more rollouts than the groups hold, no pair is left, or
-            no store of an expert that fits.
+        ValueError: an unknown kind, ranking or way to pair, more rollouts than the groups hold, nothing is left to
+            learn from, or no store of an expert that fits.
     """
     data = check_data(data, store.provenance.num_rollouts)
     if data.kind == "expert":
@@ -133,7 +133,12 @@ def make_candidates(
             )[0]
             group = _against(group, played[keys.TOKENS][drawn], played[keys.TOKEN_VALID])
         groups.append(group)
-    return [group for group in groups if group.token_valid.any()]
+    if not (kept := [group for group in groups if group.token_valid.any()]):
+        raise ValueError(
+            f"none of the {len(store)} scenes of {store.folder} has anything to learn from; raise "
+            "method.data.rankings_per_scene, or take more scenes."
+        )
+    return kept
 
 
 def _group(data: DictConfig, context: SceneContext, ranked: TensorDict, chosen: Chosen) -> Group:
@@ -231,7 +236,7 @@ def _check(data: DictConfig, held: int) -> None:
                 f"method.data.pairs=all takes every pair, and method.data.num={data.num} asks for some; say "
                 "method.data.num=null, and rankings_per_scene to keep fewer."
             )
-        _check_rankings(data, held * (held - 1) // 2)
+        _check_pairs(data, held * (held - 1) // 2)
         return
     if data.kind == "ranking" and data.num is None:
         return
@@ -244,11 +249,17 @@ def _check(data: DictConfig, held: int) -> None:
             raise ValueError(f"method.data.{name} must be 1 or more, got {data[name]}.")
     _check_enough(data, held)
     if data.kind == "pairs":
-        _check_rankings(data, data.num)
+        _check_pairs(data, data.num)
 
 
-def _check_rankings(data: DictConfig, pairs: int) -> None:
-    if data.rankings_per_scene is not None and data.rankings_per_scene > pairs:
+def _check_pairs(data: DictConfig, pairs: int) -> None:
+    if data.margin < 0:
+        raise ValueError(f"method.data.margin must be 0 or more, got {data.margin}.")
+    if data.rankings_per_scene is None:
+        return
+    if not data.rankings_per_scene > 0:
+        raise ValueError(f"method.data.rankings_per_scene must be positive, got {data.rankings_per_scene}.")
+    if data.rankings_per_scene > pairs:
         raise ValueError(
             f"method.data.rankings_per_scene={data.rankings_per_scene} and a scene has {pairs} pairs; lower it, take "
             "more of the rollouts (method.data.num), or collect more of them."
@@ -273,7 +284,10 @@ def _check_enough(data: DictConfig, held: int) -> None:
 def _check_expert(data: DictConfig, store: PreferenceStore, expert: PreferenceStore | None) -> PreferenceStore:
     """The store of the expert, if it speaks of the same scenes in the same tokens."""
     if expert is None:
-        raise ValueError("method.data.kind=expert needs rollouts of an expert, and there are none; give their store.")
+        raise ValueError(
+            "method.data.kind=expert needs rollouts of an expert, and there are none; say expert=DIR, the folder of "
+            "their preferences."
+        )
     for name in ("scenes", "horizon", "vocab_size"):
         mine, other = getattr(store.provenance, name), getattr(expert.provenance, name)
         if mine != other:

@@ -98,7 +98,7 @@ def probe(model: MotionLM, reference: MotionLM, probes: Iterable[Probe], device:
         ``reward_accuracy`` (share of those whose preferred rollout gained more over the reference, ties count half: a
         policy that has learnt nothing has 0.5), the negative log-likelihood per token [nats] of the demonstration, of
         the preferred and of the unpreferred rollouts, and along the rollouts the ``entropy`` and the ``kl`` from the
-        reference per token [nats]. NaN where there is no token.
+        reference per token [nats]. NaN where there is no token: then nothing is the likelier one.
     """
     return [_probed(model, reference, each, device) for each in probes]
 

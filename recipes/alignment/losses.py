@@ -13,6 +13,7 @@ from dpa.losses import (
     token_network,
 )
 from dpa.policy import MotionLM
+from envs import keys
 from recipes.alignment.candidates import SIDES
 from recipes.common.cli import build
 
@@ -41,6 +42,12 @@ def check_fit(method: DictConfig) -> None:
     Raises:
         ValueError: for instance a ranking loss for pairs.
     """
+    data = method.data
+    if method.loss.get("credit") == "agent" and not (data.kind == "pairs" and data.rank_by == keys.DISTANCE):
+        raise ValueError(
+            "method.loss.credit=agent needs pairs that agents are ranked in one by one: method.data.kind=pairs and "
+            f"rank_by={keys.DISTANCE}, got {data.kind} and {data.get('rank_by')}."
+        )
     wanted = getattr(LOSSES.get(method.loss.kind), "sides", None)
     given = SIDES.get(method.data.kind)
     if wanted is None or given is None or given in FITS[wanted]:

@@ -40,6 +40,21 @@ def build_distance(section: DictConfig, name: str) -> Distance:
     return build(DISTANCES[kind], OmegaConf.create(options), name)
 
 
+def ranking_options(section: DictConfig, differing: DictConfig) -> DictConfig:
+    """Options of another distance: those of a section where it does not say otherwise; of another kind, its own alone.
+
+    Examples:
+        >>> section = OmegaConf.create({"kind": "preference", "stride": 5, "weights": "paper"})
+        >>> ranking_options(section, OmegaConf.create({"weights": "normalised"}))
+        {'kind': 'preference', 'stride': 5, 'weights': 'normalised'}
+        >>> ranking_options(section, OmegaConf.create({"kind": "displacement", "measure": "final"}))
+        {'kind': 'displacement', 'measure': 'final'}
+    """
+    if differing.get("kind", section.kind) != section.kind:
+        return differing
+    return OmegaConf.merge(section, differing)
+
+
 def open_ranked_scenes(folder: str | Path, scenes: SceneStore) -> PreferenceStore:
     """A preference store of some scenes, whoever rolled them out.
 

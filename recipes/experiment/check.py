@@ -14,11 +14,28 @@ from recipes.alignment.candidates import check_data
 from recipes.alignment.losses import check_fit, make_loss
 from recipes.common.cli import check_steps, told_of
 from recipes.common.models import policy_config
-from recipes.common.rankings import build_distance
+from recipes.common.rankings import build_distance, ranking_options
 from recipes.experiment.methods import read_setups
 
 CHECKPOINTS = ("last", "select", "all")
 """What becomes of the snapshots of an alignment: there are none, one of them may be chosen, or each is shown."""
+
+COUNTS = (
+    "collection.num_rollouts",
+    "decoding.num_rollouts",
+    "evaluation.num_rollouts",
+    "drift_rollouts",
+    "pictures.num_rollouts",
+    "pictures.kept",
+    "pretraining.batch_size",
+    "pretraining.tune_interval",
+    "alignment.scenes_per_step",
+    "alignment.pairs_per_scene",
+    "alignment.watch_interval",
+    "alignment.watch_scenes",
+    "alignment.watch_pairs",
+)
+"""Options that count something of which there must be one."""
 
 
 def check_experiment(cfg: DictConfig) -> None:
@@ -38,10 +55,17 @@ def check_experiment(cfg: DictConfig) -> None:
         raise ValueError(f"seeds must be one or more, each once, got {list(cfg.seeds)}.")
     if cfg.aligned_scenes is not None and cfg.aligned_scenes < 1:
         raise ValueError(f"aligned_scenes must be 1 or more, or null for all, got {cfg.aligned_scenes}.")
+    _check_counts(cfg)
     _check_decodings(cfg)
     _check_rankings(cfg)
     _check_methods(cfg)
     _check_report(cfg)
+
+
+def _check_counts(cfg: DictConfig) -> None:
+    for name in COUNTS:
+        if (count := OmegaConf.select(cfg, name)) < 1:
+            raise ValueError(f"{name} must be 1 or more, got {count}.")
 
 
 def _check_decodings(cfg: DictConfig) -> None:
@@ -58,7 +82,7 @@ def _check_decodings(cfg: DictConfig) -> None:
 def _check_rankings(cfg: DictConfig) -> None:
     own = build_distance(cfg.collection.ranking, "collection.ranking")
     for name, options in cfg.rankings.items():
-        build_distance(OmegaConf.merge(cfg.collection.ranking, options), f"rankings.{name}")
+        build_distance(ranking_options(cfg.collection.ranking, options), f"rankings.{name}")
     if cfg.pictures.scenes and not isinstance(own, PreferenceDistance):
         raise ValueError(
             f"the player shows couplings, and collection.ranking.kind={cfg.collection.ranking.kind} couples nothing; "
@@ -97,8 +121,10 @@ def _check_report(cfg: DictConfig) -> None:
         raise ValueError(
             f"experiment.checkpoints must be one of {', '.join(CHECKPOINTS)}, got {experiment.checkpoints!r}."
         )
-    if experiment.checkpoints != "last" and not cfg.alignment.snapshots:
+    snapshots, steps = list(cfg.alignment.snapshots), cfg.alignment.steps
+    if experiment.checkpoints != "last" and not any(step < steps for step in snapshots):
         raise ValueError(
-            f"experiment.checkpoints={experiment.checkpoints} needs checkpoints: say for example "
-            f"alignment.snapshots=[{cfg.alignment.steps // 2}]."
+            f"experiment.checkpoints={experiment.checkpoints} needs a snapshot before step {steps} and "
+            f"alignment.snapshots is {snapshots}; say for example alignment.snapshots=[{steps // 2}], or "
+            "experiment.checkpoints=last."
         )

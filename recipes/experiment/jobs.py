@@ -23,7 +23,7 @@ from recipes.alignment.watch import Watch
 from recipes.collect import collect
 from recipes.common.cli import finished, finite, told_of
 from recipes.common.models import open_policy, weights_digest
-from recipes.common.rankings import TimedDistance, build_distance, open_ranked_scenes
+from recipes.common.rankings import TimedDistance, build_distance, open_ranked_scenes, ranking_options
 from recipes.common.scenes import fingerprint, open_splits
 from recipes.evaluate import evaluate, mean_known
 from recipes.experiment.methods import setup_of
@@ -59,7 +59,7 @@ def learnt_from(cfg: DictConfig, num_scenes: int) -> list[int] | None:
 def rerank_job(cfg: DictConfig, seed: int, source: str, ranking: str) -> None:
     """The same rollouts, ranked by another distance."""
     runs, scenes = runs_of(cfg), open_splits(cfg.scenes).train
-    section = OmegaConf.merge(cfg.collection.ranking, cfg.rankings[ranking])
+    section = ranking_options(cfg.collection.ranking, cfg.rankings[ranking])
     given, made = (runs.preferences(seed, "train", source, name) for name in (None, ranking))
     rerank(section, scenes, runs.policy(seed, source), given, made)
 

@@ -51,7 +51,8 @@ def read_setups(cfg: DictConfig) -> dict[str, Setup]:
         cfg: with ``methods``, ``rankings`` and ``experiment.setup``.
 
     Raises:
-        ValueError: a setup of no method, a policy or ranking that does not exist, or methods that need each other.
+        ValueError: a setup of no method, a policy or ranking that does not exist, an expert too many or too few, or
+            methods that need each other.
     """
     given = cfg.experiment.setup
     for name in given:
@@ -69,6 +70,11 @@ def read_setups(cfg: DictConfig) -> dict[str, Setup]:
             raise ValueError(
                 f"experiment.setup.{name}.expert={setup.expert} is for methods.{name}.data.kind=expert, which is "
                 f"{cfg.methods[name].data.kind}."
+            )
+        if setup.expert is None and cfg.methods[name].data.kind == "expert":
+            raise ValueError(
+                f"methods.{name}.data.kind=expert learns from another method's rollouts; say whose: "
+                f"experiment.setup.{name}.expert=METHOD."
             )
         if not setup.length > 0:
             raise ValueError(f"experiment.setup.{name}.length must be positive, got {setup.length}.")

@@ -17,8 +17,8 @@ class Stages:
     """Runs stages and keeps how long each job took when it was done for the first time.
 
     Several experiments share an account, as they share what the jobs make: reading a result back costs nothing in it.
-    Seconds are those of one worker. Of training they count all steps; of other jobs that a kill cut short only what was
-    left to do afterwards.
+    Seconds are those of one worker. Of training they count all steps; of other jobs that a kill or an error beside them
+    cut short only what was left to do afterwards.
 
     Args:
         workers: that run the jobs.

@@ -166,26 +166,21 @@ def summarise_experiment(
             method: {str(seed): results.runs.relative(results.runs.training(seed, method)) for seed in cfg.seeds}
             for method in cfg.methods
         },
-        "budget": {method: budget(cfg, chosen.best[method].policy) for method in cfg.methods},
+        "budget": {method: budget(cfg, method) for method in cfg.methods},
         "stages": dict(stages),
         "worker_seconds": sum(stages.values()),
         "config": plain(cfg),
     }
 
 
-def budget(cfg: DictConfig, policy: str) -> dict[str, Any]:
+def budget(cfg: DictConfig, method: str) -> dict[str, Any]:
     """What one training run takes in, with the runs that it goes on from and the expert that it learns from.
-
-    Args:
-        cfg: of the experiment.
-        policy: a method, or a snapshot of it: then up to there.
 
     Returns:
         ``steps``, ``rollouts`` (read in these steps) and ``start``.
     """
-    method = method_of(policy)
     setup, data = setup_of(cfg, method), cfg.methods[method].data
-    options, steps = setup.merged(cfg.alignment), steps_of(cfg, policy)
+    options, steps = setup.merged(cfg.alignment), steps_of(cfg, method)
     sides = 1 if SIDES[data.kind] == "targets" else 2
     before = [budget(cfg, name) for name in (setup.start, setup.expert) if name not in (None, REFERENCE)]
     read = steps * options.scenes_per_step * options.pairs_per_scene * sides

@@ -105,8 +105,9 @@ def test_every_experiment_runs_in_the_folder_of_the_first(
 ) -> None:
     reference = (finished / "seed_0/reference/policy.pt").stat().st_mtime_ns
     more = [f"experiment={name}"]
-    if name == "scaling":  # four rollouts of a scene make one pair of its quarters
-        more += [f"methods.omf_r{r}.data.rankings_per_scene=1" for r in (2, 4, 8)]
+    if name == "scaling":  # four rollouts of a scene make two pairs of its halves
+        more += [f"methods.omf_r{r}.data.num=2" for r in ("0_25", "0_5", 1, 2, 4, 8)]
+        more += [f"methods.omf_r{r}.data.rankings_per_scene=2" for r in (4, 8)]
     outcome = run("compare", *command(options, finished, *more))
     assert outcome.status == 0, outcome.err
     found = experiment(finished, name)

@@ -64,8 +64,9 @@ def test_a_method_comes_after_those_that_it_starts_from_or_learns_from() -> None
         (("experiment.checkpoints=best",), "experiment.checkpoints must be one of last, select, all, got 'best'"),
         (
             ("experiment.checkpoints=all", "alignment.snapshots=[]"),
-            r"needs checkpoints: say for example alignment.snapshots=\[75\]",
+            r"needs a snapshot before step 150 and alignment.snapshots is \[\]; say .*snapshots=\[75\]",
         ),
+        (("alignment.steps=60",), r"needs a snapshot before step 60 and alignment.snapshots is \[75\]"),
         (("decoding.common=[0.5,1.0]",), r"decoding.common=\[0.5, 1.0\] must be one of decoding.grid"),
         (("decoding.grid=[0.95,0.85]",), r"decoding.grid takes pairs \[top-p, temperature\], got 0.95"),
         (("decoding.grid=[[0.95,1.0],[1.5,1.0]]",), r"top_p must lie in \(0, 1\], got 1.5"),
@@ -86,15 +87,44 @@ def test_a_method_comes_after_those_that_it_starts_from_or_learns_from() -> None
         (("ranking@collection.ranking=displacement",), "couples nothing; say pictures.scenes=0"),
         (("experiment.versus=cpl",), "experiment.versus=cpl is no method of the experiment; name one of dpa_omf"),
         (
-            ("experiment=scaling", "collection.num_rollouts=16"),
-            r"methods\.omf_r8: method\.data\.rankings_per_scene=8 and a scene has 4 pairs",
+            ("experiment=scaling", "collection.num_rollouts=8"),
+            r"methods\.omf_r0_25: method\.data\.num=8 needs 16 rollouts of a scene and there are 8",
         ),
+        (
+            ("experiment=scaling", "methods.omf_r8.data.rankings_per_scene=9"),
+            r"methods\.omf_r8: method\.data\.rankings_per_scene=9 and a scene has 8 pairs",
+        ),
+        (("methods.dpa_omf.data.rankings_per_scene=0",), "rankings_per_scene must be positive, got 0"),
+        (("methods.dpa_omf.data.margin=-0.1",), "methods.dpa_omf: method.data.margin must be 0 or more, got -0.1"),
+        (
+            ("methods.dpa_adef.loss.credit=agent",),
+            "methods.dpa_adef: method.loss.credit=agent needs pairs .* got pairs and ade",
+        ),
+        (
+            ("experiment=losses", "~experiment.setup.afd_expert"),
+            "methods.afd_expert.data.kind=expert .* say whose: experiment.setup.afd_expert.expert=METHOD",
+        ),
+        (("collection.ranking.stride=0",), "stride must be 1 or more steps, got 0"),
+        (("evaluation.num_rollouts=0",), "evaluation.num_rollouts must be 1 or more, got 0"),
+        (("drift_rollouts=0",), "drift_rollouts must be 1 or more, got 0"),
+        (("alignment.watch_interval=0",), "alignment.watch_interval must be 1 or more, got 0"),
         (("methods.dpa_omf.data.kind=pair",), r"methods\.dpa_omf: method\.data\.kind must be one of"),
     ],
 )
 def test_an_experiment_that_cannot_work_is_refused_before_any_work(options: tuple[str, ...], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         check_experiment(configuration(*options))
+
+
+@pytest.mark.parametrize("name", [name for name in EXPERIMENTS if name != "base"])
+def test_what_the_demo_s_page_offers_fits_the_demo(name: str) -> None:
+    with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):
+        check_experiment(compose("demo", [f"experiment={name}"]))
+
+
+def test_another_kind_of_distance_may_rank_the_rollouts_again() -> None:
+    other = "+rankings.final={kind:displacement,measure:final}"
+    check_experiment(configuration(other, "+experiment.setup.dpa_omf={ranking:final}"))
 
 
 def test_one_name_is_one_training_in_all_experiments() -> None:
@@ -147,7 +177,6 @@ def test_a_budget_counts_what_a_method_starts_from_and_whom_it_learns_from() -> 
     own = {"steps": 150, "rollouts": 150 * 6 * 2, "start": "reference"}
     rounds = configuration("experiment=rounds")
     assert budget(rounds, "dpa_omf") == own
-    assert budget(rounds, "dpa_omf@75") == own | {"steps": 75, "rollouts": 75 * 6 * 2}
     assert budget(rounds, "omf_round_3") == {"steps": 450, "rollouts": 450 * 6 * 2, "start": "omf_round_2"}
     expert = budget(configuration("experiment=losses"), "afd_expert")
     assert expert == own | {"steps": 300, "rollouts": 150 * 6 * 2 + 150 * 6}, (

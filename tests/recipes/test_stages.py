@@ -772,7 +772,7 @@ def test_the_ladder_has_its_rungs_in_order_and_reads_them_back(
 ) -> None:
     out = tmp_path / "ladder.json"
     policies = f"policies=[{runs / 'reference/policy.pt'}]"
-    command = options("ladder", policies, f"output={tmp_path / 'ladder'}", f"json={out}", "evaluation.num_rollouts=8")
+    command = options("ladder", policies, f"output={tmp_path / 'ladder'}", f"json={out}", "num_rollouts=8")
     outcome = run("ladder", *command)
     assert outcome.status == 0, outcome.err
     rungs = json.loads(out.read_text())["rungs"]

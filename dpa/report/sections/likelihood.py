@@ -102,8 +102,9 @@ def _table_3(
         cells = [stacked(None, None) if each is None else stacked(each.mean, (each.low, each.high)) for each in changes]
         rows.append([f"{experiment.labels[mine]} {MINUS} {experiment.labels[other]}", *cells])
     note = (
-        f"On {experiment.reported}; realism and minADE at the common decoding. Differences with 95 % intervals, bold "
-        "where 0 lies outside."
+        f"On {experiment.reported}; realism and minADE at the common decoding; pair accuracy, which depends on "
+        "none, of the checkpoint that was chosen for the best one. Differences with 95 % intervals, bold where 0 lies "
+        "outside."
     )
     head = element("h3", "Who learns the ranking (table 3)")
     return joined([head, table(["method", *OF_TABLE_3.values()], rows), hint(note)])

@@ -16,7 +16,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = write_runs(tmp_path_factory.mktemp("study"))
     trained = folder / "seed_0" / "dpa_omf"
     (trained / "checkpoints").mkdir()
-    for file in ("policy.pt", "checkpoints/state.json", ".partial-eval.json"):
+    (trained / "wandb" / "offline-run").mkdir(parents=True)
+    for file in ("policy.pt", "checkpoints/state.json", ".partial-eval.json", "wandb/offline-run/metadata.json"):
         (trained / file).write_text("{}")
     return folder
 
@@ -46,8 +47,8 @@ def test_it_holds_the_values_behind_every_row_and_the_curves_and_neither_weights
     kept = {file.relative_to(runs).as_posix() for file in runs.rglob("*.csv")} | {"stages.json"}
     kept |= {file.relative_to(runs).as_posix() for file in runs.glob("seed_*/*/eval_*.json")}
     assert kept <= names
-    left = {"players.json", *(name for name in names if "preferences_" in name or "checkpoints/" in name)}
-    assert not names & left and all(name.endswith((".json", ".csv")) and ".partial-" not in name for name in names)
+    unwanted = ("players.json", "wandb/", "checkpoints/", "preferences_", ".partial-", ".pt")
+    assert not [name for name in names if any(part in name for part in unwanted)]
 
 
 def test_equal_studies_give_equal_files(runs: Path, archive: Path, tmp_path: Path) -> None:
