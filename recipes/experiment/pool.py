@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from envs.progress import progress, stage, use_line
+from envs.progress import message, progress, stage, use_line
 from envs.workers import end_with_parent
 
 
@@ -68,22 +68,33 @@ class Workers:
 
         Raises:
             ChildProcessError: a worker was killed.
-            Exception: the first error of a job; jobs that have not started are dropped.
+            Exception: the first error of a job. It is told at once; jobs that have not started are dropped, and those
+                under way end first, so that what they did is not lost.
         """
         if self._pool is None:
             for job in progress(jobs, name, unit="job"):
                 yield job.name, *_work(job, self.threads)
             return
         futures = {self._pool.submit(_work, job, self.threads): job.name for job in jobs}
-        try:
-            with progress(total=len(jobs), description=name, unit="job") as bar:
-                for future in as_completed(futures):
+        failed: BaseException | None = None
+        with progress(total=len(jobs), description=name, unit="job") as bar:
+            for future in as_completed(futures):
+                if future.cancelled():
+                    continue
+                if future.exception() is None:
                     yield futures[future], *future.result()
-                    bar.update()
-        except BrokenProcessPool as error:
+                elif failed is None:
+                    failed = future.exception()
+                    message(f"{futures[future]}: {failed} (jobs under way end first)")
+                    for other in futures:
+                        other.cancel()
+                bar.update()
+        if isinstance(failed, BrokenProcessPool):
             raise ChildProcessError(
                 f"a worker of {name!r} was killed, perhaps for want of memory; run it again with workers=1."
-            ) from error
+            ) from failed
+        if failed is not None:
+            raise failed
 
 
 def _start(lock: Any, started: Any) -> None:

@@ -8,6 +8,7 @@ import json
 import os
 import re
 import shutil
+import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -823,6 +824,20 @@ def test_the_error_of_a_job_is_the_error_of_all_and_the_workers_go_on() -> None:
             list(workers.run([Job(json.loads, ("{",), "bad")], "jobs"))
         ((name, _, result),) = workers.run([Job(json.loads, ("{}",), "good")], "jobs")
         assert (name, result) == ("good", {})
+
+
+def test_jobs_under_way_beside_one_that_fails_are_not_lost_and_no_other_is_begun(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bad, slow = Job(json.loads, ("{",), "bad"), Job(time.sleep, (2,), "slow")
+    later = [Job(os.mkdir, (str(tmp_path / str(number)),), str(number)) for number in range(20)]
+    ended = []
+    with Workers(2, threads=1) as workers:
+        list(workers.run([Job(time.sleep, (0,), "start")] * 4, "warm"))
+        with pytest.raises(ValueError, match="Expecting property name"):
+            ended += (name for name, *_ in workers.run([bad, slow, *later], "jobs"))
+    assert "slow" in ended and len(list(tmp_path.iterdir())) < len(later) / 2
+    assert "bad: Expecting property name" in capsys.readouterr().err, "told at once"
 
 
 def test_a_killed_worker_is_told_with_what_to_do() -> None:
