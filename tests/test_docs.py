@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import functools
 import importlib.util
+import json
 import re
 import shlex
+import zipfile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +16,9 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from dpa.ranking import AGGREGATES, FEATURES, SOLVERS
+from dpa.report.statistics import paired_bootstrap
+from dpa.report.study import Study, read_study
+from dpa.report.text import comparison_table
 from envs import keys
 from envs.convert.__main__ import make_parser as convert_parser
 from envs.sources import SOURCES
@@ -241,6 +246,37 @@ def test_pictures_of_the_documents_are_small() -> None:
     pictures = sorted((REPOSITORY / "docs" / "images").iterdir())
     assert pictures
     assert not [picture.name for picture in pictures if picture.stat().st_size > 150_000]
+
+
+STUDIES = sorted((REPOSITORY / "docs" / "studies").glob("*.zip"))
+
+
+@pytest.fixture(scope="module", params=STUDIES, ids=lambda path: path.stem)
+def study(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Study:
+    folder = tmp_path_factory.mktemp(request.param.stem)
+    zipfile.ZipFile(request.param).extractall(folder)
+    return read_study(folder)
+
+
+def test_the_tables_of_the_results_are_those_of_the_studies_beside_them(study: Study) -> None:
+    told = (REPOSITORY / "docs" / "results.md").read_text(encoding="utf-8")
+    for experiment in study.experiments.values():
+        for comparison in (experiment.own_best, experiment.at_common):
+            rows = comparison_table(experiment, comparison).splitlines()
+            assert not [row for row in rows if row not in told]
+
+
+def test_a_reader_gets_the_intervals_of_a_study_from_the_values_of_its_scenes(study: Study) -> None:
+    for experiment in study.experiments.values():
+        content = json.loads((study.folder / "experiments" / f"{experiment.name}.json").read_text())["own_best"]
+        scores: dict[str, list[list[float]]] = {}
+        for row in content["rows"]:
+            values = json.loads((study.folder / row["file"]).read_text())["per_scene"]["realism"]
+            scores.setdefault(row["method"], []).append(values)
+        for entry in content["paired"]:
+            again = paired_bootstrap(scores[entry["method"]], scores["reference"])
+            assert again.mean == pytest.approx(entry["realism_difference"], abs=1e-9)
+            assert [again.low, again.high] == pytest.approx(entry["ci95"], abs=1e-9)
 
 
 if __name__ == "__main__":

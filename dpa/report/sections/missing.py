@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Iterable
 
-from dpa.report.markup import Section, element, hint, joined
+from dpa.report.markup import Section, element
 from dpa.report.study import STUDIES, Study
 
 OF_ONE = ("experiment", "method", "rankings", "pictures")
@@ -29,7 +30,9 @@ def missing_section(study: Study, experiments: Iterable[str]) -> Section | None:
     references = sorted(folder.glob("seed_*/reference/policy.pt")) or ["POLICY.pt"]
     policies = ",".join(map(str, references))
     lacking |= {
-        name: f"python -m recipes.{name} policies=[{policies}] output={folder / name}"
+        name: shlex.join(
+            ["python", "-m", f"recipes.{name}", *_scenes(study), f"policies=[{policies}]", f"output={folder / name}"]
+        )
         for name in STUDIES
         if name not in study.summaries
     }
@@ -38,8 +41,7 @@ def missing_section(study: Study, experiments: Iterable[str]) -> Section | None:
     if not lacking:
         return None
     rows = [element("li", name, ": ", element("code", command)) for name, command in lacking.items()]
-    about = hint("Studies of rankings take the options of the scenes that the other commands have.")
-    return Section("missing", "Not here yet", joined([element("ul", *rows), about]))
+    return Section("missing", "Not here yet", element("ul", *rows))
 
 
 def _options(study: Study) -> list[str]:
@@ -47,3 +49,9 @@ def _options(study: Study) -> list[str]:
     given = shlex.split(study.main.command)[3:] if study.main is not None else []
     kept = [each for each in given if not each.lstrip("+~").startswith(OF_ONE) and not each.startswith("output=")]
     return [*kept, f"output={study.folder}"]
+
+
+def _scenes(study: Study) -> list[str]:
+    """Options that name the scenes of the main experiment, whatever YAML they came from."""
+    given = study.main.config.get("scenes", {}) if study.main is not None else {}
+    return [f"scenes.{name}={json.dumps(given[name])}" for name in ("source", "train", "tune", "eval") if name in given]

@@ -370,13 +370,15 @@ def test_what_is_missing_is_named_with_its_command(copied: Path, tmp_path: Path)
     (copied / "players.json").unlink()
     (copied / "experiments" / "steps.json").unlink()
     given = "python -m recipes.compare scenes=made experiment=methods '~methods.cpl' 'seeds=[0,1,2]' output=elsewhere"
-    change(copied, "methods", command=given)
+    scenes = {"source": "sumo", "train": "num_scenes=120,split=train", "tune": 16, "eval": "split=test", "limit": None}
+    change(copied, "methods", command=given, config={"scenes": scenes})
     study = read_study(copied)
     page = Page(write_study(tmp_path / "p.html", study, experiments=["methods", "steps"]).read_text(encoding="utf-8"))
     missing = page.text.partition("Not here yet")[2]
     for wanted in (
         f"experiment steps: python -m recipes.compare experiment=steps scenes=made 'seeds=[0,1,2]' output={copied}",
-        "validity: python -m recipes.validity policies=[POLICY.pt]",
+        "validity: python -m recipes.validity 'scenes.source=\"sumo\"' 'scenes.train=\"num_scenes=120,split=train\"' "
+        "scenes.tune=16 'scenes.eval=\"split=test\"' 'policies=[POLICY.pt]'",
         f"scenes to play: python -m recipes.compare scenes=made 'seeds=[0,1,2]' output={copied} pictures.scenes=3",
     ):
         assert wanted in missing
