@@ -52,7 +52,7 @@ SECTIONS = {
     "play": ("threads", "scenes"),
     "rerank": ("threads", "scenes"),
     "spread": ("threads", "scenes"),
-    "ladder": ("threads", "scenes", "model", "evaluation"),
+    "ladder": ("threads", "scenes", "model"),
     "tokens": ("threads", "scenes", "model"),
     "look": ("threads", "scenes"),
     "validity": ("threads", "scenes"),

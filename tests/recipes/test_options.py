@@ -78,7 +78,7 @@ def test_scenes_that_do_not_exist_are_told_by_path(
     run: Callable, options: Callable, recipe: str, tmp_path: Path
 ) -> None:
     more = [] if recipe in WITHOUT_POLICY else ["policy=none.pt"]
-    more += ["policies=none.pt"] if recipe == "play" else []
+    more += {"play": ["policies=none.pt"], "compare": ["alignment.snapshots=[2]"]}.get(recipe, [])
     command = options(recipe, *more, "scenes.train=nowhere", f"{output_of(recipe)}={tmp_path / 'out'}")
     assert_refused(run(recipe, *command), "nowhere")
 
