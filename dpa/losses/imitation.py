@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from dpa.losses.network import logits_under, scene_mean, token_divergence
@@ -48,11 +47,6 @@ class ImitationLoss(NextTokenLoss):
 
     keeps_reference = True
     out_keys = ["loss_next_token", "accuracy", "entropy", "kl"]
-
-    def __init__(self, actor_network: TensorDictModule, *, label_smoothing: float = 0.0) -> None:
-        super().__init__(actor_network, label_smoothing=label_smoothing)
-        # The reference stays as it is: tell torchrl, which warns otherwise, that no updater is missing.
-        self._has_update_associated["actor_network"] = True
 
     def _diagnostics(self, batch: TensorDict, logits: Tensor) -> dict[str, Tensor]:
         reference = logits_under(self.target_actor_network_params, self.actor_network, batch)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictParams
 from torch import Tensor, nn
+from torchrl.objectives import LossModule
 
 CONTEXT = "context"
 LOGITS = "logits"
@@ -18,6 +19,14 @@ def token_network(model: nn.Module) -> TensorDictModule:
             ``[S, M or 1, A, T]``; gives logits ``[S, M, A, T, V]`` (:class:`~dpa.policy.MotionLM` does).
     """
     return TensorDictModule(model, in_keys=[CONTEXT, "tokens", "token_valid"], out_keys=[LOGITS])
+
+
+def hold_network(loss: LossModule, network: TensorDictModule, *, keep_reference: bool) -> None:
+    """Make a network that of a loss, if asked to beside a frozen copy of it as it is now."""
+    loss.convert_to_functional(network, "actor_network", create_target_params=keep_reference)
+    if keep_reference:
+        # The reference stays as it is: tell torchrl, which warns otherwise, that no updater is missing.
+        loss._has_update_associated["actor_network"] = True
 
 
 def logits_under(parameters: TensorDictParams, network: TensorDictModule, batch: TensorDictBase) -> Tensor:

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModule, TensorDictParams, dispatch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from dpa.losses.network import CONTEXT, logits_under, masked_mean, token_entropy
+from dpa.losses.network import CONTEXT, hold_network, logits_under, masked_mean, token_entropy
 from envs import keys
 
 
@@ -79,7 +79,7 @@ class NextTokenLoss(LossModule):
         super().__init__()
         if not 0 <= label_smoothing < 1:
             raise ValueError(f"label_smoothing must lie in [0, 1), got {label_smoothing}.")
-        self.convert_to_functional(actor_network, "actor_network", create_target_params=self.keeps_reference)
+        hold_network(self, actor_network, keep_reference=self.keeps_reference)
         self.label_smoothing = label_smoothing
 
     @property

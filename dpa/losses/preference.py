@@ -14,6 +14,7 @@ from torchrl.objectives import LossModule
 
 from dpa.losses.network import (
     CONTEXT,
+    hold_network,
     logits_under,
     scene_mean,
     token_divergence,
@@ -191,9 +192,7 @@ class PreferenceLoss(LossModule):
         check_positive("alpha", alpha)
         check_choice("score_reduction", score_reduction, get_args(Reduction))
         check_not_negative("cloning", cloning)
-        self.convert_to_functional(actor_network, "actor_network", create_target_params=True)
-        # The reference stays as it is: tell torchrl, which warns otherwise, that no updater is missing.
-        self._has_update_associated["actor_network"] = True
+        hold_network(self, actor_network, keep_reference=True)
         self.alpha, self.reference = alpha, reference
         self.score_reduction, self.cloning = score_reduction, cloning
 

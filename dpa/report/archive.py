@@ -25,7 +25,7 @@ def write_archive(path: Path, folder: Path) -> Path:
     again, without its scenes to play and its cards of preferences.
 
     Args:
-        path: ``.zip`` to write; it appears whole or not at all.
+        path: ``.zip`` to write, in a folder that is there; it appears whole or not at all.
         folder: of the study.
 
     Returns:
@@ -40,7 +40,6 @@ def write_archive(path: Path, folder: Path) -> Path:
         ['stages.json']
         >>> folder.cleanup()
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     with whole(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
         for file in files_of(folder):
             entry = zipfile.ZipInfo(file.relative_to(folder).as_posix(), EPOCH)

@@ -81,18 +81,19 @@ class Workers:
             for future in as_completed(futures):
                 if future.cancelled():
                     continue
-                if future.exception() is None:
+                error = future.exception()
+                if error is None:
                     yield futures[future], *future.result()
+                elif isinstance(error, BrokenProcessPool):
+                    raise ChildProcessError(
+                        f"a worker of {name!r} was killed, perhaps for want of memory; run it again with workers=1."
+                    ) from error
                 elif failed is None:
-                    failed = future.exception()
+                    failed = error
                     message(f"{futures[future]}: {failed} (jobs under way end first)")
                     for other in futures:
                         other.cancel()
                 bar.update()
-        if isinstance(failed, BrokenProcessPool):
-            raise ChildProcessError(
-                f"a worker of {name!r} was killed, perhaps for want of memory; run it again with workers=1."
-            ) from failed
         if failed is not None:
             raise failed
 
