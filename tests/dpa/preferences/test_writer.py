@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import multiprocessing
 import os
 import random
@@ -119,7 +120,8 @@ def test_four_processes_that_append_overlapping_scenes_store_each_once(tmp_path:
 @pytest.mark.parametrize("kills", [4, pytest.param(50, marks=pytest.mark.slow)])
 def test_writers_killed_at_random_moments_leave_what_one_that_lives_leaves(tmp_path: Path, kills: int) -> None:
     """One of two writers at a time is killed; a store that is full before there were enough kills is begun anew."""
-    draw, killed, folder, found = random.Random(0), 0, tmp_path / "0", set()
+    folders = (tmp_path / str(number) for number in itertools.count())
+    draw, killed, folder, found = random.Random(0), 0, next(folders), set()
     while killed < kills:
         other = Appending(folder, range(NUM_SCENES - 2, NUM_SCENES), chunk=1)
         killed += Appending(folder, chunk=1).kill(after=draw.uniform(0, 0.1))
@@ -128,7 +130,7 @@ def test_writers_killed_at_random_moments_leave_what_one_that_lives_leaves(tmp_p
         found.add(len(PreferenceStore(folder)))
         if len(PreferenceStore(folder)) == NUM_SCENES:
             assert_whole(folder)
-            folder = tmp_path / str(killed)
+            folder = next(folders)
     assert len(found) > 1, "kills came at different moments"
     Appending(folder).end()
     assert_whole(folder)
