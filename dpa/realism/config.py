@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -123,7 +124,7 @@ class RealismConfig:
 
     @classmethod
     def load(cls, name: str | Path) -> RealismConfig:
-        """Read a configuration.
+        """Read a configuration: one of ours once in a process, a file of a user's anew each time.
 
         Args:
             name: of a file in :data:`FOLDER` (``"2024"``, ``"2025"``), or a path that ends in ``.yaml``.
@@ -131,27 +132,7 @@ class RealismConfig:
         Raises:
             ValueError: no such configuration, or its keys are not the expected ones.
         """
-        path = Path(name) if str(name).endswith(".yaml") else FOLDER / f"{name}.yaml"
-        if not path.is_file():
-            known = sorted(file.stem for file in FOLDER.glob("*.yaml"))
-            raise ValueError(f"no realism configuration {str(name)!r}; use one of {known} or the path of a .yaml file.")
-        try:
-            data = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except yaml.YAMLError as error:
-            raise ValueError(f"{path} is not YAML: {error}") from None
-        _check_keys(data, {field.name for field in dataclasses.fields(cls)} - {"name"}, path, "the file")
-        switches = ("ttc_vehicle_only", "traffic_lights", "scenario_generation")
-        plain = {"corner_rounding": float, "height_stretch": float} | dict.fromkeys(switches, bool)
-        return cls(
-            name=path.stem,
-            differences=_choice(data["differences"], get_args(Differences), path, "differences"),
-            quirks=frozenset(
-                Quirk(_choice(name, [*Quirk], path, "quirks")) for name in _read(list, data["quirks"], path, "quirks")
-            ),
-            continuous=_read_group(data["continuous"], CONTINUOUS, path, "continuous"),
-            indicators=_read_group(data["indicators"], INDICATORS, path, "indicators"),
-            **{name: _read(kind, data[name], path, name) for name, kind in plain.items()},
-        )
+        return _read_file(Path(name)) if str(name).endswith(".yaml") else _read_ours(str(name))
 
     def __post_init__(self) -> None:
         weight = self.indicators["traffic_light_violation"].weight
@@ -172,6 +153,35 @@ class RealismConfig:
         if not self.traffic_lights:
             del weights["traffic_light_violation"]
         return weights
+
+
+@cache
+def _read_ours(name: str) -> RealismConfig:
+    return _read_file(FOLDER / f"{name}.yaml")
+
+
+def _read_file(path: Path) -> RealismConfig:
+    if not path.is_file():
+        known = sorted(file.stem for file in FOLDER.glob("*.yaml"))
+        name = path.stem if path.parent == FOLDER else str(path)
+        raise ValueError(f"no realism configuration {name!r}; use one of {known} or the path of a .yaml file.")
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path} is not YAML: {error}") from None
+    _check_keys(data, {field.name for field in dataclasses.fields(RealismConfig)} - {"name"}, path, "the file")
+    switches = ("ttc_vehicle_only", "traffic_lights", "scenario_generation")
+    plain = {"corner_rounding": float, "height_stretch": float} | dict.fromkeys(switches, bool)
+    return RealismConfig(
+        name=path.stem,
+        differences=_choice(data["differences"], get_args(Differences), path, "differences"),
+        quirks=frozenset(
+            Quirk(_choice(name, [*Quirk], path, "quirks")) for name in _read(list, data["quirks"], path, "quirks")
+        ),
+        continuous=_read_group(data["continuous"], CONTINUOUS, path, "continuous"),
+        indicators=_read_group(data["indicators"], INDICATORS, path, "indicators"),
+        **{name: _read(kind, data[name], path, name) for name, kind in plain.items()},
+    )
 
 
 def _read_group(data: Any, names: tuple[str, ...], path: Path, where: str) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 
 import torch
@@ -217,15 +216,8 @@ def realism_of_groups(
 
 
 def _opened(config: str | Path | RealismConfig, quirks: bool) -> RealismConfig:
-    if not isinstance(config, RealismConfig):
-        config = RealismConfig.load(config) if str(config).endswith(".yaml") else _of_year(str(config))
-    return config if quirks else config.replace(quirks=frozenset())
-
-
-@cache
-def _of_year(name: str) -> RealismConfig:
-    """A configuration of ours, read once: a file of a user's may change meanwhile, and these do not."""
-    return RealismConfig.load(name)
+    opened = config if isinstance(config, RealismConfig) else RealismConfig.load(config)
+    return opened if quirks else opened.replace(quirks=frozenset())
 
 
 def _batches(comparisons: list[Comparison], budget: float) -> Iterator[list[Comparison]]:
