@@ -114,6 +114,22 @@ def encode(scene: Scene) -> bytes:
     return zstandard.ZstdCompressor(level=LEVEL, write_checksum=True).compress(b"".join(parts) + letters)
 
 
+def checksum(block: bytes) -> int:
+    """The checksum of a scene's content (XXH64, its lower 32 bits), which Zstandard puts at the end of a block.
+
+    It is that of the unpacked bytes, so it says the same of a scene whichever version of the library packed it.
+
+    Examples:
+        >>> from envs.sources.synthetic import straight_road
+        >>> scene = straight_road(2)
+        >>> before = checksum(encode(scene))
+        >>> scene.agents.predict[0] ^= True
+        >>> before == checksum(encode(straight_road(2))), before == checksum(encode(scene))
+        (True, False)
+    """
+    return int.from_bytes(block[-4:], "little")
+
+
 def decode(block: bytes) -> Scene:
     """Unpack one scene; its tensors are new and may be changed.
 

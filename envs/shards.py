@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from envs.card import Card
-from envs.codec import decode, encode
+from envs.codec import checksum, decode, encode
 from envs.files import write_bytes
 from envs.framing import Framing
 from envs.scene import Scene, SceneError
@@ -25,7 +25,7 @@ from envs.validation import check_scene_id
 
 Content = TypeVar("Content")
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 """Of the files in a store; a store of another version must be converted again."""
 SUFFIX = ".scenes"
 """Of a shard's file."""
@@ -38,6 +38,7 @@ _RECORD_SHAPE = {
     "scene_ids": [str],
     "units": [(str, int)],
     "sizes": [int],
+    "checksums": [int],
     "num_agents": [int],
     "has_lights": [bool],
     "lacks": [int],
@@ -58,6 +59,7 @@ class ShardRecord:
         scene_ids: in order.
         units: where each scene came from, ``(input, record)``.
         sizes: bytes of each scene's block.
+        checksums: of each scene's content, see :func:`~envs.codec.checksum`.
         num_agents: agents of each scene that are present at the current step.
         has_lights: whether each scene has a traffic light.
         lacks: flags of :class:`~envs.scene.Lacks` of each scene.
@@ -70,6 +72,7 @@ class ShardRecord:
     scene_ids: list[str] = field(default_factory=list)
     units: list[tuple[str, int]] = field(default_factory=list)
     sizes: list[int] = field(default_factory=list)
+    checksums: list[int] = field(default_factory=list)
     num_agents: list[int] = field(default_factory=list)
     has_lights: list[bool] = field(default_factory=list)
     lacks: list[int] = field(default_factory=list)
@@ -120,6 +123,7 @@ class ShardWriter:
         record.scene_ids.append(scene.scene_id)
         record.units.append(unit)
         record.sizes.append(len(block))
+        record.checksums.append(checksum(block))
         record.num_agents.append(int(scene.agents.present.sum()))
         record.has_lights.append(len(scene.lights.lane_id) > 0)
         record.lacks.append(int(scene.lacks))
@@ -205,7 +209,7 @@ def _check_record(record: ShardRecord, path: Path, end: int) -> None:
     for name, shape in _RECORD_SHAPE.items():
         check_shape(getattr(record, name), shape, name)
     record.units = [(name, number) for name, number in record.units]
-    for name in ("units", "sizes", "num_agents", "has_lights", "lacks"):
+    for name in ("units", "sizes", "checksums", "num_agents", "has_lights", "lacks"):
         if len(getattr(record, name)) != len(record.scene_ids):
             raise ValueError(f"{name} has not one value for each of {len(record.scene_ids)} scenes")
     _FRAMING.check_sizes(record.sizes, end)

@@ -161,6 +161,11 @@ class SceneStore:
         return self._gather("num_agents", np.int64)
 
     @property
+    def checksums(self) -> np.ndarray:
+        """``[len]`` int64: of each scene's content, see :func:`~envs.codec.checksum`."""
+        return self._gather("checksums", np.int64)
+
+    @property
     def has_lights(self) -> np.ndarray:
         """``[len]`` bool: whether each scene has a traffic light."""
         return self._gather("has_lights", np.bool_)

@@ -10,6 +10,7 @@ Methods differ in one YAML each: dpa_omf, dpa_adef, sft_best_oa, sft_best_ade, a
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 import hydra
@@ -56,13 +57,16 @@ def align(
 ) -> Path:
     """Fine-tune a policy with one method.
 
+    The policy is trained without dropout: methods compare log-likelihoods of whole rollouts, in whose differences its
+    noise would be all that counts at first.
+
     Args:
         cfg: with the sections ``alignment``, ``logger``, ``device``.
         method: ``data`` and ``loss``, from ``config/method``.
         scenes: that the preferences are of.
         policy: file of the policy to start from, which is also the reference of the loss.
         preferences: folder of the store that :mod:`recipes.collect` made with it.
-        seed: of batches and dropout.
+        seed: of batches.
         folder: of the run; snapshots are kept in ``step_<step>`` inside.
         ranks: that train together; the scenes of a step are theirs together.
         expert: folder of the store with the rollouts of an expert (``data.kind: expert``).
@@ -90,8 +94,8 @@ def align(
         "scenes": fingerprint(scenes.subset(learnt)),
         "seed": seed,
         "reference": weights_digest(model),
-        "ranking": store.provenance.ranking,
-        "expert": None if played is None else played.provenance.policy,
+        "preferences": asdict(store.provenance),
+        "expert": None if played is None else asdict(played.provenance),
     }
     snapshots = {step: folder / f"step_{step}" / "policy.pt" for step in options.snapshots if step <= options.steps}
     if ranks.agree(finished(result, decided_by) is not None and path.is_file(), "finished =", folder):
@@ -101,7 +105,7 @@ def align(
     candidates = make_candidates(method.data, store, scenes, context, model.tokenizer.cpu(), seed, played, learnt)
     check_enough(candidates, options.pairs_per_scene)
     look = Look(watch, context, model.to(device), options) if watch is not None and ranks.main else None
-    loss = ranks.wrap(make_loss(method.loss, model.to(device).train()))
+    loss = ranks.wrap(make_loss(method.loss, model.to(device)))
     optimizer = make_optimizer(model, options.lr, options.weight_decay)
     schedule = make_schedule(optimizer, options.steps, options.warmup)
     saturation = SaturationWatch(method.loss)
@@ -125,7 +129,6 @@ def align(
         for step in run.steps():
             draw = make_generator(seed, "pairs", step)
             groups = [candidates[i] for i in order(step)]
-            ranks.seed_dropout(seed, step)
             losses = accumulate_gradients(loss, parts_of(groups, options, draw, device, ranks), ranks)
             norm = clip_and_step(optimizer, options.max_norm, schedule)
             if (warning := saturation(step, losses)) and ranks.main:
@@ -180,7 +183,7 @@ def main(cfg: DictConfig) -> None:
     splits = open_splits(cfg.scenes)
     policy, preferences = Path(cfg.policy), Path(cfg.preferences)
     expert = None if cfg.expert is None else Path(cfg.expert)
-    watch = None if cfg.watch is None else Watch(splits.tune, Path(cfg.watch))
+    watch = None if cfg.watch is None else Watch(splits.tune, Path(cfg.watch), policy)
     with join_ranks(cfg.device) as ranks:
         path = align(
             cfg,

@@ -54,7 +54,7 @@ def collect(
     """
     indices = range(len(scenes)) if indices is None else indices
     options = cfg.collection
-    model, context, _ = open_policy(policy, cfg.device)
+    model, context, config = open_policy(policy, cfg.device)
     distance = distance or build_distance(options.ranking, "collection.ranking")
     # What is wrong with an option is told before a store is begun with it.
     decoding = build(Decoding, options.decoding, "collection.decoding")
@@ -72,6 +72,7 @@ def collect(
         num_rollouts=options.num_rollouts,
         horizon=context.horizon,
         vocab_size=model.tokenizer.vocab_size,
+        tokenizer=config["tokenizer"],
     )
     with PreferenceWriter(folder, provenance, chunk_scenes=options.chunk_scenes) as writer:
         done = writer.scenes_done

@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 
 from dpa.policy import Decoding
 from dpa.ranking import Distance
-from dpa.realism import RealismResult, mean_result, realism
+from dpa.realism import RealismConfig, RealismResult, mean_result, realism
 from dpa.realism.submission import SubmissionWriter, plan_submission
 from dpa.rollout import make_collector
 from dpa.safety import MEASURES, safety
@@ -77,10 +77,11 @@ def evaluate(
     options = cfg.evaluation
     model, context, _ = open_policy(policy, cfg.device)
     distance = build_distance(cfg.collection.ranking, "collection.ranking")
+    metric = RealismConfig.load(str(options.metric))
     decided_by = {
         "policy": weights_digest(model),
         "scenes": fingerprint(scenes),
-        "evaluation": deciding(options, "memory") | {"metric": str(options.metric)},
+        "evaluation": deciding(options, "memory") | {"metric": [metric.name, metric.digest]},
         "ranking": distance.describe(),
         "decoding": asdict(decoding),
         "seed": seed,
@@ -109,7 +110,7 @@ def evaluate(
             device=cfg.device,
         )
         for each in rolled(batches, scenes, options.num_rollouts, ready):
-            scored[each.index] = score_scene(each, distance, str(options.metric))
+            scored[each.index] = score_scene(each, distance, metric)
             partial.add({each.index: scored[each.index]})
             if submission is not None:
                 submission.add(each.index, each.scene, each.trajectories, each.controlled)
@@ -122,13 +123,13 @@ def evaluate(
     return content
 
 
-def score_scene(each: Rolled, distance: Distance, metric: str) -> dict[str, Any]:
+def score_scene(each: Rolled, distance: Distance, metric: RealismConfig) -> dict[str, Any]:
     """The :class:`~dpa.realism.RealismResult` of one scene's rollouts as plain numbers, and figures of our own.
 
     Args:
         each: scene and rollouts.
         distance: how far rollouts are from the log.
-        metric: year of the realism metric, or a YAML.
+        metric: the realism metric.
     """
     return {
         "result": asdict(realism(each.scene, each.trajectories, metric)),

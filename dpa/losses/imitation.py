@@ -5,7 +5,7 @@ from __future__ import annotations
 from tensordict import TensorDict
 from torch import Tensor
 
-from dpa.losses.network import logits_under, scene_mean, token_divergence
+from dpa.losses.network import masked_mean, reference_logits, token_divergence
 from dpa.losses.next_token import NextTokenLoss
 from envs import keys
 
@@ -23,7 +23,7 @@ class ImitationLoss(NextTokenLoss):
         label_smoothing: share of the target spread over all tokens.
 
     Returns, besides what :class:`~dpa.losses.NextTokenLoss` does, ``kl``: of the policy from the copy, per valid token,
-    over the vocabulary, the mean over scenes [nats], detached.
+    over the vocabulary, as the loss a mean over tokens [nats], detached.
 
     Examples:
         >>> import torch
@@ -49,5 +49,5 @@ class ImitationLoss(NextTokenLoss):
     out_keys = ["loss_next_token", "accuracy", "entropy", "kl"]
 
     def _diagnostics(self, batch: TensorDict, logits: Tensor) -> dict[str, Tensor]:
-        reference = logits_under(self.target_actor_network_params, self.actor_network, batch)
-        return {"kl": scene_mean(token_divergence(logits, reference), batch[keys.TOKEN_VALID])}
+        drift = token_divergence(logits, reference_logits(self, batch))
+        return {"kl": masked_mean(drift, batch[keys.TOKEN_VALID])}

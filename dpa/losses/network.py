@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictParams
 from torch import Tensor, nn
@@ -33,6 +34,15 @@ def logits_under(parameters: TensorDictParams, network: TensorDictModule, batch:
     """Logits ``[S, M, A, T, V]`` of a network under some parameters of its kind; the batch stays as it is."""
     with parameters.to_module(network):
         return network(batch.copy())[LOGITS]
+
+
+def reference_logits(loss: LossModule, batch: TensorDictBase) -> Tensor:
+    """Logits of the frozen copy of a loss's network: without gradients, and without dropout even in training."""
+    network, training = loss.actor_network, loss.actor_network.training
+    with torch.no_grad():
+        logits = logits_under(loss.target_actor_network_params, network.eval(), batch)
+    network.train(training)
+    return logits
 
 
 def masked_mean(value: Tensor, mask: Tensor) -> Tensor:

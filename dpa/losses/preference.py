@@ -16,6 +16,7 @@ from dpa.losses.network import (
     CONTEXT,
     hold_network,
     logits_under,
+    reference_logits,
     scene_mean,
     token_divergence,
     token_entropy,
@@ -227,8 +228,8 @@ class PreferenceLoss(LossModule):
             batch_size=tokens.shape[:1],
         )
         logits = logits_under(self.actor_network_params, self.actor_network, batch)
+        reference = reference_logits(self, batch)
         with torch.no_grad():
-            reference = logits_under(self.target_actor_network_params, self.actor_network, batch)
             drift = token_divergence(logits, reference)
         log_prob = token_log_prob(logits, tokens)
         gain = log_prob - token_log_prob(reference, tokens) if self.reference else log_prob

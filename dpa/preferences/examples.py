@@ -21,6 +21,7 @@ def example_provenance(num_rollouts: int = 8) -> Provenance:
         num_rollouts=num_rollouts,
         horizon=16,
         vocab_size=169,
+        tokenizer={"name": "verlet"},
     )
 
 

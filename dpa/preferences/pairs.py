@@ -119,7 +119,7 @@ def separated(
         relative: the margin is a share of the mean distance of the scene instead.
 
     Returns:
-        ``[S, M]`` bool. A margin of 0 keeps ties too.
+        ``[S, M]`` bool. A margin of 0 keeps ties too; any other does not, even where the mean distance is 0.
 
     Raises:
         ValueError: the margin is negative, or a distance is not finite.
@@ -135,7 +135,8 @@ def separated(
     if not margin >= 0:
         raise ValueError(f"a margin is 0 or more, got {margin}.")
     least = margin * distance.mean(-1, keepdim=True) if relative else margin
-    return distance.gather(-1, unpreferred) - distance.gather(-1, preferred) >= least
+    gap = distance.gather(-1, unpreferred) - distance.gather(-1, preferred)
+    return (gap >= least) & ((gap > 0) | (margin == 0))
 
 
 def thin_out(kept: Tensor, rankings: float, generator: torch.Generator) -> Tensor:

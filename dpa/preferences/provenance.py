@@ -13,7 +13,7 @@ import numpy as np
 from envs.shards import check_shape
 from envs.sources.fields import one_line, shown
 
-FORMAT = 2
+FORMAT = 3
 """Version of the store's layout."""
 METADATA_FILE = "metadata.json"
 MAX_METADATA = 1 << 20
@@ -27,6 +27,7 @@ _SHAPE = {
     "num_rollouts": int,
     "horizon": int,
     "vocab_size": int,
+    "tokenizer": {str: object},
 }
 """Of the fields of :class:`Provenance`, see :func:`~envs.shards.check_shape`."""
 
@@ -48,6 +49,7 @@ class Provenance:
         num_rollouts: K.
         horizon: T.
         vocab_size: V.
+        tokenizer: options that decide what a token means.
     """
 
     policy: str
@@ -58,6 +60,7 @@ class Provenance:
     num_rollouts: int
     horizon: int
     vocab_size: int
+    tokenizer: dict[str, Any]
 
     @property
     def features(self) -> tuple[str, ...]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import cache
@@ -141,6 +143,19 @@ class RealismConfig:
                 f"realism configuration {self.name!r} gives traffic_light_violation the weight {weight} but has "
                 "traffic_lights: false; set one of them."
             )
+
+    @property
+    def digest(self) -> str:
+        """Of all that decides a score: two files of one name need not agree.
+
+        Examples:
+            >>> config = RealismConfig.load("2024")
+            >>> config.digest == config.replace(name="mine").digest, config.digest == config.replace(quirks=()).digest
+            (True, False)
+        """
+        content = dataclasses.asdict(self) | {"quirks": sorted(self.quirks)}
+        del content["name"]
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
     def replace(self, **changes: Any) -> RealismConfig:
         """A copy with some attributes changed."""

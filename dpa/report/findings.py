@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dpa.report.experiment import Decoding, Experiment, decoding_of, in_words
+from dpa.report.statistics import SCENES
 from dpa.report.table import REFERENCE, signed
 
 FEW_SEEDS = 5
@@ -24,6 +25,12 @@ def headline(experiment: Experiment) -> str:
     low, high = entry["ci95"]
     name, where = experiment.labels[experiment.headline], f"on {experiment.reported}"
     interval = f"95 % interval [{signed(low)}, {signed(high)}]"
+    if entry["over"] == SCENES:
+        change = signed(entry["realism_difference"])
+        return (
+            f"No claim about a method from one training run: each at its own best decoding, this {name} differs from "
+            f"its reference by {change} realism {where} ({interval} over scenes alone)."
+        )
     if low <= 0 <= high:
         change = signed(entry["realism_difference"])
         return (
@@ -77,8 +84,8 @@ def chosen_on_the_same(experiment: Experiment) -> str | None:
     if experiment.split != "tune":
         return None
     return (
-        "Decodings were chosen on these very tuning scenes, so what methods reach at their own best is a little too "
-        "good, for all alike."
+        "Decodings were chosen on these very tuning scenes, so what methods and reference reach at their own best is a "
+        "little too good, for all alike: each had the same decodings to choose from."
     )
 
 
@@ -138,12 +145,12 @@ def _decoding(experiment: Experiment, entry: Mapping[str, Any]) -> list[str]:
     if sharper:
         best = max(sharper, key=lambda e: e["realism_difference"])
         notes.append(
-            f"Sampling alone moves the reference by up to {signed(best['realism_difference'])} "
+            f"Sampling alone moves the reference by {signed(best['realism_difference'])} at best "
             f"(at {in_words(decoding_of(best))} instead of {in_words(experiment.common)})."
         )
     edges = [
         f"{experiment.labels[method]} ({in_words(experiment.chosen[method])})"
-        for method in (REFERENCE, experiment.headline)
+        for method in dict.fromkeys((REFERENCE, experiment.versus, experiment.headline))
         if method in experiment.chosen and _at_edge(experiment.chosen[method], grid)
     ]
     if edges:
@@ -156,15 +163,16 @@ def _decoding(experiment: Experiment, entry: Mapping[str, Any]) -> list[str]:
 def _at_edge(chosen: Decoding, grid: list[Decoding]) -> bool:
     """The best of a row of decodings is its last: one beyond was never tried.
 
-    A row is of three or more that differ in one number alone: of two, either is the last. Beyond top-p 1 there is none.
+    A row is of decodings that differ in one number alone; of two, one is tried beyond neither. Beyond top-p 1 there is
+    none.
 
     Examples:
-        >>> grid = [(1.0, 1.0), (0.9, 1.0), (0.8, 1.0), (0.9, 0.8)]
+        >>> grid = [(1.0, 1.0), (0.9, 1.0), (0.8, 1.0)]
         >>> [_at_edge(chosen, grid) for chosen in grid]
-        [False, False, True, False]
+        [False, False, True]
     """
     for place, value in enumerate(chosen):
         row = sorted({decoding[place] for decoding in grid if decoding[1 - place] == chosen[1 - place]})
-        if len(row) >= 3 and (value == row[0] or (value == row[-1] and not (place == 0 and value == 1))):
+        if len(row) > 1 and (value == row[0] or (value == row[-1] and not (place == 0 and value == 1))):
             return True
     return False

@@ -196,6 +196,26 @@ def _choose_pairs(data: DictConfig, distance: Tensor, seed: int) -> list[Chosen]
     return [Chosen(near[rows], far[rows]) for near, far, rows in zip(preferred, unpreferred, kept, strict=True)]
 
 
+def num_candidates(data: DictConfig, held: int) -> tuple[int, int]:
+    """How many rollouts of a scene stand on either side, M and N, before any pair is left out.
+
+    Args:
+        data: of a method, see :func:`make_candidates`.
+        held: K, rollouts of a scene.
+
+    Examples:
+        >>> data = OmegaConf.create({"kind": "sets", "rank_by": "distance", "num": 0.25, "num_unpreferred": 16})
+        >>> num_candidates(data, held=32)
+        (8, 16)
+    """
+    data = check_data(data, held)
+    if data.kind == "ranking":
+        whole = data.num or held
+        return (whole + 1) // 2, whole // 2
+    num = held * (held - 1) // 2 if data.kind == "pairs" and data.pairs == "all" else data.num
+    return num, {"best": 0, "sets": data.get("num_unpreferred")}.get(data.kind, num)
+
+
 def check_data(data: DictConfig, held: int) -> DictConfig:
     """Refuse options of a method's data before any work.
 
@@ -288,7 +308,7 @@ def _check_expert(data: DictConfig, store: PreferenceStore, expert: PreferenceSt
             "method.data.kind=expert needs rollouts of an expert, and there are none; say expert=DIR, the folder of "
             "their preferences."
         )
-    for name in ("scenes", "horizon", "vocab_size"):
+    for name in ("scenes", "horizon", "tokenizer"):
         mine, other = getattr(store.provenance, name), getattr(expert.provenance, name)
         if mine != other:
             raise ValueError(

@@ -60,8 +60,24 @@ def draw_rows(group: Group, num: int, draw: torch.Generator) -> Draw:
     preferred = _some(len(group.preferred), num, draw)
     if group.unpreferred is None or group.sides == "pairs":
         return Draw(group, preferred, preferred)
-    others = -(-len(group.unpreferred) * len(preferred) // len(group.preferred))
+    _, others = num_drawn(len(group.preferred), len(group.unpreferred), num)
     return Draw(group, preferred, _some(len(group.unpreferred), others, draw))
+
+
+def num_drawn(preferred: int, unpreferred: int, num: int) -> tuple[int, int]:
+    """How many rollouts a step takes of either side.
+
+    Args:
+        preferred: M, those that a scene has.
+        unpreferred: N.
+        num: asked for of the preferred ones.
+
+    Examples:
+        >>> num_drawn(preferred=8, unpreferred=16, num=1), num_drawn(preferred=2, unpreferred=2, num=4)
+        ((1, 2), (2, 2))
+    """
+    drawn = min(preferred, num)
+    return drawn, -(-unpreferred * drawn // preferred)
 
 
 def make_batch(drawn: list[Draw]) -> TensorDict:

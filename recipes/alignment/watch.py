@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 from dpa.policy import ContextOptions, MotionLM
 from envs.store import SceneStore
 from recipes.alignment.likelihoods import PROBED, make_probes, probe
+from recipes.common.models import open_policy
 from recipes.common.rankings import open_ranked_scenes
 
 
@@ -21,10 +22,13 @@ class Watch(NamedTuple):
     Attributes:
         scenes: tuning scenes.
         preferences: folder of a store of ranked rollouts of them.
+        reference: file of the policy that drift is measured from; in a second round it is not the one that the
+            training starts from.
     """
 
     scenes: SceneStore
     preferences: Path
+    reference: Path
 
 
 class Look:
@@ -33,7 +37,7 @@ class Look:
     Args:
         watch: the scenes.
         context: how scenes are cut up.
-        model: in training, and as it is now the reference of ``tune/kl``.
+        model: in training.
         options: the section ``alignment``.
 
     Raises:
@@ -46,7 +50,8 @@ class Look:
         pairs = min(options.watch_pairs, store.provenance.num_rollouts // 2)
         tokenizer = copy.deepcopy(model.tokenizer).cpu()  # logs are read on the CPU, wherever the model is
         self.probes = make_probes(store, watch.scenes, context, tokenizer, pairs, rows)
-        self.model, self.reference = model, copy.deepcopy(model).eval()
+        reference, _, _ = open_policy(watch.reference)
+        self.model, self.reference = model, reference.to(next(model.parameters()).device)
 
     def __call__(self, device: str) -> dict[str, float]:
         """Means over the scenes, as curves are named."""

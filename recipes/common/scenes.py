@@ -77,8 +77,9 @@ def _drawn(pool: SceneStore, count: int, seed: int) -> tuple[SceneStore, SceneSt
 
 
 def fingerprint(scenes: SceneStore) -> str:
-    """Digest of the scenes' ids in order: an index means nothing without it."""
-    return hashlib.sha256("\n".join(scenes.scene_ids).encode()).hexdigest()[:16]
+    """Digest of the scenes in order, of what is in them as well as of their ids: an index means nothing without it."""
+    rows = zip(scenes.scene_ids, scenes.checksums.tolist(), strict=True)
+    return hashlib.sha256("\n".join(f"{name} {checksum}" for name, checksum in rows).encode()).hexdigest()[:16]
 
 
 def _chosen(scenes: SceneStore, select: DictConfig, split: str) -> SceneStore:

@@ -121,6 +121,11 @@ def _check_report(cfg: DictConfig) -> None:
         raise ValueError(
             f"experiment.checkpoints must be one of {', '.join(CHECKPOINTS)}, got {experiment.checkpoints!r}."
         )
+    if experiment.split == "tune" and experiment.checkpoints == "select":
+        raise ValueError(
+            "experiment.checkpoints=select chooses checkpoints on the tuning scenes, and experiment.split=tune reports "
+            "on them: methods would have an advantage over the reference; say experiment.checkpoints=last or all."
+        )
     snapshots, steps = list(cfg.alignment.snapshots), cfg.alignment.steps
     if experiment.checkpoints != "last" and not any(step < steps for step in snapshots):
         raise ValueError(

@@ -6,6 +6,7 @@ clock, which does not see what a killed process had done.
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -78,7 +79,7 @@ def align_job(cfg: DictConfig, seed: int, method: str) -> dict[str, float]:
             seed,
             folder,
             expert=None if setup.expert is None else runs.preferences(seed, "train", setup.expert),
-            watch=Watch(splits.tune, runs.preferences(seed, "tune")),
+            watch=Watch(splits.tune, runs.preferences(seed, "tune"), runs.policy(seed, REFERENCE)),
             among=learnt_from(cfg, len(splits.train)),
         )
     return {"align": seconds_trained(folder)}
@@ -111,7 +112,7 @@ def likelihood_job(cfg: DictConfig, seed: int, policy: str, split: str) -> None:
         "scenes": fingerprint(scenes),
         "pairs": pairs,
         "rollouts": cfg.drift_rollouts,
-        "ranking": store.provenance.ranking,
+        "preferences": asdict(store.provenance),
         "seed": seed,
     }
     if finished(path, decided_by) is not None:

@@ -12,7 +12,8 @@ from dpa.policy import Decoding
 from dpa.report.experiment import read_json
 from dpa.report.statistics import compare_methods
 from dpa.report.table import REFERENCE
-from recipes.alignment.candidates import SIDES
+from recipes.alignment.candidates import num_candidates
+from recipes.alignment.draws import num_drawn
 from recipes.alignment.likelihoods import PROBED
 from recipes.common.cli import plain
 from recipes.common.scenes import Splits
@@ -179,11 +180,11 @@ def budget(cfg: DictConfig, method: str) -> dict[str, Any]:
     Returns:
         ``steps``, ``rollouts`` (read in these steps) and ``start``.
     """
-    setup, data = setup_of(cfg, method), cfg.methods[method].data
+    setup = setup_of(cfg, method)
     options, steps = setup.merged(cfg.alignment), steps_of(cfg, method)
-    sides = 1 if SIDES[data.kind] == "targets" else 2
+    held = num_candidates(cfg.methods[method].data, cfg.collection.num_rollouts)
     before = [budget(cfg, name) for name in (setup.start, setup.expert) if name not in (None, REFERENCE)]
-    read = steps * options.scenes_per_step * options.pairs_per_scene * sides
+    read = steps * options.scenes_per_step * sum(num_drawn(*held, options.pairs_per_scene))
     return {
         "steps": steps + sum(each["steps"] for each in before),
         "rollouts": read + sum(each["rollouts"] for each in before),

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from envs.codec import decode, encode
 from envs.scene import Lights, MapKind, Scene, SceneError, SceneSource, collate
-from envs.shards import Shard
+from envs.shards import FORMAT_VERSION, Shard
 from envs.sources.synthetic import build_scene, red_light, straight_road, two_cars_head_on
 from envs.store import SceneStore
 
@@ -199,14 +199,14 @@ def change_json(path: Path, **changes: object) -> None:
 
 def test_another_version_is_refused(store: SceneStore) -> None:
     change_json(store.folders[0] / "manifest.json", version=99)
-    with pytest.raises(SceneError, match=r"manifest\.json: version 99 where 2"):
+    with pytest.raises(SceneError, match=r"manifest\.json: version 99 where 3"):
         SceneStore(*store.folders)
 
 
 def test_a_shard_of_another_version_is_refused(store: SceneStore) -> None:
     path = store.folders[0] / "00000.scenes"
     path.write_bytes(path.read_bytes()[:-1] + b"\x01")
-    with pytest.raises(SceneError, match=r"00000\.scenes: damaged \(no shard of version 2"):
+    with pytest.raises(SceneError, match=r"00000\.scenes: damaged \(no shard of version 3"):
         SceneStore(*store.folders)
 
 
@@ -217,7 +217,7 @@ def test_an_unfinished_conversion_is_refused(store: SceneStore) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", ["{", "[]", '{"version": 2}', '{"version": 2, "surprise": 2}', "[" * 100_000, "\x00"]
+    "content", ["{", "[]", '{"version": 3}', '{"version": 3, "surprise": 2}', "[" * 100_000, "\x00"]
 )
 def test_a_damaged_manifest_is_refused(store: SceneStore, content: str) -> None:
     (store.folders[0] / "manifest.json").write_text(content)
@@ -256,7 +256,7 @@ def rewrite(path: Path, change_block: Callable = bytes, **changes: object) -> No
     ends = [*accumulate(shard.record.sizes, initial=8)]
     blocks = [data[start:end] for start, end in pairwise(ends)]
     blocks[0] = zstandard.compress(change_block(zstandard.decompress(blocks[0])))
-    content = {"version": 2, **asdict(shard.record), "sizes": [*map(len, blocks)], **changes}
+    content = {"version": FORMAT_VERSION, **asdict(shard.record), "sizes": [*map(len, blocks)], **changes}
     record = zstandard.compress(json.dumps(content).encode())
     path.write_bytes(data[:8] + b"".join(blocks) + record + struct.pack("<Q", len(record)) + data[:8])
 
@@ -370,7 +370,7 @@ def test_verify_finds_one_changed_byte(store: SceneStore, name: str, place: floa
 def test_a_cut_shard_is_refused(store: SceneStore, cut: int) -> None:
     path = store.folders[0] / "00001.scenes"
     path.write_bytes(path.read_bytes()[:-cut])
-    with pytest.raises(SceneError, match=r"00001\.scenes: damaged \(no shard of version 2, or a cut one"):
+    with pytest.raises(SceneError, match=r"00001\.scenes: damaged \(no shard of version 3, or a cut one"):
         Shard(path)
 
 

@@ -138,7 +138,7 @@ def huge_record(files: Files, r: Random) -> Files:
     name = _pick_shard(files, r)
     size = r.choice((2**20, 2**23 - 2**10, 2**28))
     text = r.choice((b"[[]],", b"[],", b'{"":0},', b"\x00"))
-    record = b'{"version": 2, "scene_ids": [' + text * (size // len(text)) + b"0]}"
+    record = b'{"version": 3, "scene_ids": [' + text * (size // len(text)) + b"0]}"
     return _with_checksums(files | {name: _join(_parts(files[name])[0], record)})
 
 

@@ -62,6 +62,7 @@ def test_a_method_comes_after_those_that_it_starts_from_or_learns_from() -> None
         (("+methods.reference=${methods.dpa_omf}",), "methods.reference: .* are taken"),
         (("experiment.split=train",), "experiment.split must be one of eval, tune, got 'train'"),
         (("experiment.checkpoints=best",), "experiment.checkpoints must be one of last, select, all, got 'best'"),
+        (("experiment.split=tune",), "experiment.split=tune reports on them: methods would have an advantage"),
         (
             ("experiment.checkpoints=all", "alignment.snapshots=[]"),
             r"needs a snapshot before step 150 and alignment.snapshots is \[\]; say .*snapshots=\[75\]",
@@ -179,6 +180,10 @@ def test_a_budget_counts_what_a_method_starts_from_and_whom_it_learns_from() -> 
     assert budget(rounds, "dpa_omf") == own
     assert budget(rounds, "omf_round_3") == {"steps": 450, "rollouts": 450 * 6 * 2, "start": "omf_round_2"}
     expert = budget(configuration("experiment=losses"), "afd_expert")
+    losses = configuration("experiment=losses", "methods.kto.data.num_unpreferred=0.5")
+    assert budget(losses, "kto")["rollouts"] == 150 * 6 * (1 + 2), "of twice as many unpreferred ones twice as many"
+    few = configuration("experiment=variants", "methods.combined.data.num=2")
+    assert budget(few, "combined")["rollouts"] == 150 * 6 * 2 * 2, "of two pairs a step cannot take four"
     assert expert == own | {"steps": 300, "rollouts": 150 * 6 * 2 + 150 * 6}, (
         "SFT reads one rollout where AfD reads two"
     )

@@ -15,9 +15,11 @@ from omegaconf import DictConfig, OmegaConf
 from dpa.ranking import PreferenceDistance
 from dpa.tokens import VerletTokenizer
 from envs.files import write_json
+from envs.sources.synthetic import straight_road
+from envs.store import SceneStore
 from recipes.common.cli import CONFIG, build, finished, recipe
 from recipes.common.models import TOKENIZERS, build_policy, policy_config
-from recipes.common.scenes import open_splits
+from recipes.common.scenes import fingerprint, open_splits
 
 RECIPES = ("pretrain", "collect", "align", "evaluate", "play", "ladder", "tokens", "compare", "validity", "sensitivity")
 WITHOUT_POLICY = ("pretrain", "ladder", "tokens", "compare", "play", "validity", "sensitivity")
@@ -232,6 +234,17 @@ def test_tuning_scenes_may_be_a_source_of_their_own(stores: Path) -> None:
     }.items():
         with pytest.raises(ValueError, match=told):
             open_splits(scenes(*names))
+
+
+def test_scenes_of_equal_ids_and_other_content_are_other_scenes(tmp_path: Path, write_store: Callable) -> None:
+    scenes = [straight_road(2), straight_road(3)]
+    first = SceneStore(write_store(tmp_path / "first", scenes))
+    shards = SceneStore(write_store(tmp_path / "shards", scenes[:1], scenes[1:]))
+    scenes[1].agents.predict[0] ^= True
+    other = SceneStore(write_store(tmp_path / "other", scenes))
+    assert first.scene_ids == shards.scene_ids == other.scene_ids
+    assert fingerprint(first) == fingerprint(shards) != fingerprint(other)
+    assert fingerprint(first.subset([0])) == fingerprint(other.subset([0]))
 
 
 def test_a_tokenizer_of_ones_own_has_the_options_of_its_class(monkeypatch: pytest.MonkeyPatch) -> None:

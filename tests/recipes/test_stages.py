@@ -22,6 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 from dpa.losses import ContrastivePreferenceLoss, token_network
 from dpa.policy import MotionLM, make_context
 from dpa.preferences import PreferenceStore, PreferenceWriter, nearest_farthest
+from dpa.realism.config import FOLDER
 from dpa.realism.score import score
 from dpa.realism.submission import validate
 from dpa.tokens import VerletTokenizer
@@ -36,6 +37,7 @@ from recipes import evaluate as evaluation
 from recipes.alignment.candidates import Group, make_candidates
 from recipes.alignment.draws import draw_rows, make_batch, parts_of
 from recipes.alignment.losses import check_fit, make_loss
+from recipes.alignment.watch import Look, Watch
 from recipes.common.cli import CONFIG, plain
 from recipes.common.models import open_policy
 from recipes.common.partial import PartialResult
@@ -346,7 +348,7 @@ def test_rollouts_of_an_expert_stand_against_those_of_the_reference(runs: Path, 
     ("change", "message"),
     [
         ({"scenes": "elsewhere"}, "has scenes elsewhere and"),
-        ({"vocab_size": 200}, "has vocab_size 200 and"),
+        ({"tokenizer": {"name": "verlet", "turn": 2.0}}, "has tokenizer {'name': 'verlet', 'turn': 2.0} and"),
         ({"num_rollouts": 1}, "needs as many rollouts of the expert and"),
         ({}, "lacks 6 scenes of"),
     ],
@@ -533,6 +535,31 @@ def _interrupting(step: int) -> type:
     return Interrupting
 
 
+def test_drift_is_measured_from_the_reference_also_in_a_second_round(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path
+) -> None:
+    assert run("collect", *collect_into(tmp_path / "tuned", runs, options), "split=tune").status == 0
+    assert run("align", *watched(runs, options, tmp_path / "first")).status == 0
+    cfg = compose_recipe("align", options, runs)
+    watch = Watch(open_splits(cfg.scenes).tune, tmp_path / "tuned", runs / "reference/policy.pt")
+    drift = {}
+    for name in ("reference", "first"):
+        model, context, _ = open_policy((tmp_path if name == "first" else runs) / name / "policy.pt")
+        drift[name] = Look(watch, context, model, cfg.alignment)("cpu")["tune/kl"]
+    assert drift["reference"] == pytest.approx(0, abs=1e-7) and drift["first"] > 1e-5
+
+
+def test_an_alignment_is_not_taken_for_that_of_other_rollouts_of_the_same_policy(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path
+) -> None:
+    other = collect_into(tmp_path / "other", runs, options)
+    assert run("collect", *other, "seed=7").status == 0
+    assert run("align", *watched(runs, options, tmp_path / "omf")).status == 0
+    given = [option for option in watched(runs, options, tmp_path / "omf") if "preferences=" not in option]
+    outcome = run("align", *given, f"preferences={tmp_path / 'other'}")
+    assert outcome.status == 2 and "preferences" in outcome.err
+
+
 def test_rollouts_of_other_scenes_are_not_watched(run: Callable, options: Callable, runs: Path, tmp_path: Path) -> None:
     outcome = run("align", *watched(runs, options, tmp_path / "omf", f"watch={runs / 'preferences'}"))
     assert outcome.status == 2 and "ranks rollouts of other scenes" in outcome.err
@@ -699,6 +726,18 @@ def test_an_evaluation_goes_on_where_it_stopped(
     assert json.loads((tmp_path / "evaluation.json").read_text()) == scored
     assert sorted(seen) == [0, 1, 2], "no scene is scored twice"
     assert not partial.exists()
+
+
+def test_a_metric_that_was_edited_is_another_one(run: Callable, options: Callable, runs: Path, tmp_path: Path) -> None:
+    ours, mine = FOLDER / "2024.yaml", tmp_path / "mine.yaml"
+    mine.write_text(ours.read_text())
+    command = [*score_into(tmp_path / "evaluation.json", runs, options), f"evaluation.metric={mine}"]
+    assert run("evaluate", *command).status == 0
+    assert run("evaluate", *command).status == 0, "read back"
+    mine.write_text(ours.read_text().replace("corner_rounding: 0.7", "corner_rounding: 0.5"))
+    assert mine.read_text() != ours.read_text()
+    outcome = run("evaluate", *command)
+    assert outcome.status == 2 and "evaluation.json" in outcome.err
 
 
 def test_what_was_scored_with_other_options_does_not_count(tmp_path: Path) -> None:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import pytest
 import torch
 from tensordict import TensorDict
 
-from dpa.losses import ImitationLoss, NextTokenLoss
+from dpa.losses import ImitationLoss, NextTokenLoss, token_network
+from dpa.losses.network import reference_logits
+from dpa.policy import SIZES, MotionLM, make_context
+from dpa.tokens import VerletTokenizer
+from dpa.training.batches import collate_items, log_item
+from envs.sources.synthetic import straight_road
 
 
 @pytest.fixture
@@ -39,6 +45,17 @@ def test_the_divergence_is_per_valid_token_from_where_the_policy_began(
     out = loss(best)
     assert out["kl"].item() == pytest.approx(by_hand.item(), abs=1e-6)
     assert not out["kl"].requires_grad
+
+
+def test_the_copy_is_asked_without_dropout() -> None:
+    model = MotionLM(dataclasses.replace(SIZES["nano"], dropout=0.5), VerletTokenizer()).train()
+    loss = ImitationLoss(token_network(model))
+    batch = collate_items([log_item(make_context(straight_road(2)), VerletTokenizer())])
+    with torch.no_grad():
+        expected = model.eval()(batch["context"], batch["tokens"], batch["token_valid"])
+    asked = reference_logits(loss, batch)
+    assert torch.equal(asked, expected) and torch.equal(reference_logits(loss, batch), asked)
+    assert loss.actor_network.training, "the policy keeps its dropout"
 
 
 def test_the_copy_is_not_trained(network: tuple, best: TensorDict) -> None:

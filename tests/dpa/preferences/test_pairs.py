@@ -121,6 +121,12 @@ def test_separated_pairs_are_those_with_the_gap(seed: int, margin: float, relati
     assert bool(separated(distance, preferred, unpreferred, 0.0).all())
 
 
+def test_a_margin_leaves_no_ties_where_all_distances_are_zero() -> None:
+    distance = torch.zeros(1, 4)
+    assert not separated(distance, *all_pairs(distance), 0.1, relative=True).any()
+    assert separated(distance, *all_pairs(distance), 0.0, relative=True).all()
+
+
 @settings(max_examples=50, deadline=None)
 @given(seed=SEEDS, scenes=st.integers(1, 30), more=st.floats(0, 2), rankings=st.floats(0.05, 6))
 def test_rankings_are_the_mean_of_pairs_per_scene_and_grow_with_it(
