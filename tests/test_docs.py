@@ -248,6 +248,7 @@ def test_pictures_of_the_documents_are_small() -> None:
     assert not [picture.name for picture in pictures if picture.stat().st_size > 150_000]
 
 
+SPLITS = ("train", "tune", "eval")
 STUDIES = sorted((REPOSITORY / "docs" / "studies").glob("*.zip"))
 
 
@@ -264,6 +265,20 @@ def test_the_tables_of_the_results_are_those_of_the_studies_beside_them(study: S
         for comparison in (experiment.own_best, experiment.at_common):
             rows = comparison_table(experiment, comparison).splitlines()
             assert not [row for row in rows if row not in told]
+
+
+def test_the_study_beside_the_results_has_the_options_that_its_command_gives(study: Study) -> None:
+    """Of all that decides a result; where scenes are kept, and what was shown, may differ."""
+    for experiment in study.experiments.values():
+        with initialize_config_dir(str(CONFIG), version_base="1.3"):
+            given = OmegaConf.to_container(compose("study", [f"experiment={experiment.name}"]), resolve=True)
+        made = json.loads((study.folder / "experiments" / f"{experiment.name}.json").read_text())["config"]
+        for name in ("seeds", "model", "pretraining", "collection", "alignment", "evaluation", "decoding", "rankings"):
+            assert made[name] == given[name], name
+        assert made["methods"].items() <= given["methods"].items()
+        for name in ("aligned_scenes", "drift_rollouts", "device", "threads"):
+            assert made[name] == given[name], name
+        assert [made["scenes"][split] for split in SPLITS] == [given["scenes"][split] for split in SPLITS]
 
 
 def test_a_reader_gets_the_intervals_of_a_study_from_the_values_of_its_scenes(study: Study) -> None:
