@@ -179,7 +179,7 @@ class Shard:
             return scene
         except (OSError, SceneError) as error:
             name = f"{self.path}, scene {row} ({self.record.scene_ids[row]})"
-            raise SceneError(f"{name}: {error} Convert the scenes again.") from error
+            raise SceneError(f"{name}: {error} Remove the file, then convert the scenes again.") from error
 
 
 def read_record(path: Path) -> ShardRecord:
@@ -289,22 +289,21 @@ def read_versioned(path: Path, cls: type[Content], shape: dict[str, Any]) -> Con
     Raises:
         SceneError: no such file, damaged, or of another version than :data:`FORMAT_VERSION`.
     """
+    again = f"remove {path.parent} and convert the scenes again."
     try:
         if path.stat().st_size > MAX_JSON:
-            raise SceneError(f"{path}: has more than {MAX_JSON} bytes; convert the scenes again.")
+            raise SceneError(f"{path}: has more than {MAX_JSON} bytes; {again}")
         content = dict(json.loads(path.read_text(encoding="utf-8")))
         version = content.pop("version", None)
         if version != FORMAT_VERSION:
-            raise SceneError(
-                f"{path}: version {shown(version)} where {FORMAT_VERSION} is read; convert the scenes again."
-            )
+            raise SceneError(f"{path}: version {shown(version)} where {FORMAT_VERSION} is read; {again}")
         result = cls(**content)
         for name, inner in shape.items():
             check_shape(getattr(result, name), inner, name)
         return result
     except FileNotFoundError as error:
-        raise SceneError(f"{path}: the file is missing; convert the scenes again.") from error
+        raise SceneError(f"{path}: the file is missing; {again}") from error
     except SceneError:
         raise
     except (OSError, RecursionError, TypeError, ValueError) as error:
-        raise SceneError(f"{path}: damaged ({one_line(error)}); convert the scenes again.") from error
+        raise SceneError(f"{path}: damaged ({one_line(error)}); {again}") from error

@@ -274,7 +274,9 @@ class SceneStore:
         entries = [entry for manifest in self.manifests for entry in manifest.shards]
         for entry, shard in zip(entries, self._shards, strict=True):
             if file_digest(shard.path) != entry["sha256"]:
-                raise SceneError(f"{shard.path}: changed since it was written; convert the scenes again.")
+                raise SceneError(
+                    f"{shard.path}: changed since it was written; remove it, then convert the scenes again."
+                )
             for row in range(len(shard.record.units)):
                 shard.scene(row).validate(f"{shard.path}, scene {row}")
                 tick()

@@ -33,7 +33,7 @@ from recipes.alignment.draws import parts_of
 from recipes.alignment.losses import check_fit, make_loss
 from recipes.alignment.watch import Look, Watch
 from recipes.common.cli import CONFIG, check_steps, deciding, finished, finite, plain, ranked_recipe
-from recipes.common.models import open_policy, weights_digest, write_policy
+from recipes.common.models import check_written, open_policy, weights_digest, write_policy
 from recipes.common.rankings import open_preferences
 from recipes.common.scenes import fingerprint, open_splits
 
@@ -97,9 +97,12 @@ def align(
         "preferences": asdict(store.provenance),
         "expert": None if played is None else asdict(played.provenance),
     }
+    if any(step < 1 for step in options.snapshots):
+        raise ValueError(f"alignment.snapshots are steps from 1 on, got {list(options.snapshots)}.")
     snapshots = {step: folder / f"step_{step}" / "policy.pt" for step in options.snapshots if step <= options.steps}
     if ranks.agree(finished(result, decided_by) is not None and path.is_file(), "finished =", folder):
         check_kept(snapshots, options.steps)
+        check_written(path)
         return path
     seed_everything(seed)
     candidates = make_candidates(method.data, store, scenes, context, model.tokenizer.cpu(), seed, played, learnt)

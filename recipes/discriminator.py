@@ -24,7 +24,7 @@ from torch import Tensor
 from dpa.discriminator import Discriminator, mean_squared_jerk
 from dpa.policy import ContextOptions
 from dpa.ranking import Distance, occupancy_features
-from dpa.realism import realism_of_groups
+from dpa.realism import RealismConfig, realism_of_groups
 from dpa.report.studies import plot_discriminator
 from dpa.tokens import MotionTokenizer
 from dpa.training.checkpoint import load_policy, load_weights, save_policy
@@ -180,7 +180,7 @@ def check(cfg: DictConfig) -> None:
     """Refuse options before any work.
 
     Raises:
-        ValueError: too few rollouts, a share that is none, a count that is not positive, or a split that is trained on.
+        ValueError: too few rollouts, a share that is none, a split that is trained on, or no such metric.
     """
     if cfg.num_rollouts < SMALLEST:
         raise ValueError(f"num_rollouts must be {SMALLEST} or more, got {cfg.num_rollouts}.")
@@ -188,9 +188,7 @@ def check(cfg: DictConfig) -> None:
         raise ValueError("split=train ranks the scenes that the discriminator learns from; say split=tune.")
     if not 0 < cfg.training.held_out < 1:
         raise ValueError(f"training.held_out must lie between 0 and 1, got {cfg.training.held_out}.")
-    for name in ("num_rollouts", "width", "steps", "batch_scenes", "look_interval", "patience", "checkpoint_interval"):
-        if not isinstance(cfg.training[name], int) or cfg.training[name] < 1:
-            raise ValueError(f"training.{name} must be a whole number of 1 or more, got {cfg.training[name]!r}.")
+    RealismConfig.load(str(cfg.metric))
 
 
 @hydra.main(**CONFIG, config_name="discriminator")

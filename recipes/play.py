@@ -135,6 +135,8 @@ def chosen_scenes(scenes: SceneStore, chosen: Sequence[int | str]) -> list[int]:
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.play``."""
+    if Path(cfg.output).suffix != ".html":
+        raise ValueError(f"output={cfg.output} is to be a page; name a file that ends in .html.")
     policies = policies_of(cfg)
     scenes = open_splits(cfg.scenes)[cfg.split]
     players = roll_out(

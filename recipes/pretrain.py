@@ -34,7 +34,7 @@ from envs.progress import progress
 from envs.scene import SceneSource
 from envs.seeding import make_generator
 from recipes.common.cli import CONFIG, build, check_steps, deciding, finished, ranked_recipe
-from recipes.common.models import build_policy, context_options, policy_config, write_policy
+from recipes.common.models import build_policy, check_written, context_options, policy_config, write_policy
 from recipes.common.scenes import Splits, fingerprint, open_splits
 
 OBSERVING = ("checkpoint_interval", "max_rows", "workers")
@@ -67,6 +67,7 @@ def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path, ranks: Ra
         "tuning_scenes": fingerprint(splits.tune),
     }
     if ranks.agree(finished(result, decided_by) is not None and path.is_file(), "finished =", folder):
+        check_written(path)
         return path
     seed_everything(seed)
     device = ranks.place(cfg.device)

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from dpa.ranking import Distance
 from dpa.ranking.agreement import rank_correlation
-from dpa.realism import realism_of_groups
+from dpa.realism import RealismConfig, realism_of_groups
 from dpa.report.statistics import Interval, paired_bootstrap, summary
 from dpa.report.studies import plot_validity
 from envs.files import write_json
@@ -128,12 +128,10 @@ def compare_with(measured: dict[str, list[dict]], other: str) -> dict[str, dict[
     """Realism of the ``nearest`` and the ``farthest`` window of each ranking minus another's, scene by scene.
 
     Raises:
-        ValueError: no such ranking, or no scene has realism.
+        ValueError: no scene has realism.
     """
     rows = _with_realism(measured)
     names = [name for name in rows[0][0] if name != "random"]
-    if other not in names:
-        raise ValueError(f"against must be one of {', '.join(names)}, got {other!r}.")
 
     def realism_at(name: str, place: int) -> np.ndarray:
         return np.array([[scene[name]["realism"][place] for scene in row] for row in rows])
@@ -168,6 +166,9 @@ def main(cfg: DictConfig) -> None:
     distances = distances_of(cfg.rankings, "rankings")
     if not distances:
         raise ValueError("rankings is empty: there is nothing to compare with the ADE; name at least one distance.")
+    if cfg.against not in (*distances, ADE):
+        raise ValueError(f"against must be one of {', '.join((*distances, ADE))}, got {cfg.against!r}.")
+    RealismConfig.load(str(cfg.metric))
     scenes = open_splits(cfg.scenes)[cfg.split]
     options = {key: plain(cfg)[key] for key in ("window", "stride", "metric")}
     decided_by = options | {"rankings": {name: distance.describe() for name, distance in distances.items()}}

@@ -8,17 +8,28 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import settings
 
 from tests.envs import made
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+settings.register_profile("any machine", deadline=None)  # how long an example takes says nothing of what it shows
+settings.load_profile("any machine")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_logger_at_home(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Weights & Biases keeps its files in a folder of the tests, not in the home of whoever runs them."""
+    folder = tmp_path_factory.mktemp("wandb")
+    for name in ("WANDB_DATA_DIR", "WANDB_CACHE_DIR", "WANDB_CONFIG_DIR"):
+        os.environ[name] = str(folder)
 
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """Folder with real scenes and golden values; tests that need it are skipped where it is absent."""
     folder = Path(os.environ.get("DPA_SHARED", REPOSITORY.parent / "shared"))
-    if not folder.is_dir():
+    if not (folder / "scenes").is_dir():
         pytest.skip(f"needs the real scenes and golden values in {folder} (set DPA_SHARED)")
     return folder
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -27,13 +28,15 @@ MACHINE_PATH = re.compile(r"(?<![\w.*~])/(?:" + "|".join(["work", "root"]) + r")
 
 def repository_files() -> list[Path]:
     """Files that git tracks or would track."""
+    if not (REPOSITORY / ".git").exists() or shutil.which("git") is None:
+        pytest.skip("needs git and a checkout")
     listing = subprocess.run(
         ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"],
         cwd=REPOSITORY, capture_output=True, text=True,
     )  # fmt: skip
-    if listing.returncode != 0:
-        pytest.skip(f"needs a git checkout: {listing.stderr.strip()}")
+    assert listing.returncode == 0, listing.stderr
     paths = [REPOSITORY / name for name in listing.stdout.split("\0") if name]
+    assert Path(__file__).resolve() in paths, "git lists the files of this checkout"
     return [path for path in paths if path.is_file()]
 
 

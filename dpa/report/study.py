@@ -68,11 +68,20 @@ def read_study(folder: str | Path) -> Study:
     return Study(
         folder=folder,
         experiments={path.stem: read_experiment(path) for path in paths},
-        stages=read_json(stages) if stages.is_file() else {},
+        stages=_account(stages) if stages.is_file() else {},
         players=read_json(players) if players.is_file() else None,
         summaries=summaries,
         cards=_cards(folder),
     )
+
+
+def _account(path: Path) -> dict[str, dict[str, float]]:
+    """Worker-seconds of every job, by stage."""
+    stages = read_json(path)
+    jobs = list(stages.values()) if isinstance(stages, dict) else [None]
+    if not all(isinstance(each, dict) and all(type(s) in (int, float) for s in each.values()) for each in jobs):
+        raise ValueError(f"{path} is no account of worker-seconds by stage and job; remove it, the page does without.")
+    return stages
 
 
 def _cards(folder: Path) -> dict[str, DataCard]:

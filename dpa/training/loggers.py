@@ -320,7 +320,10 @@ def _complete_rows(path: Path) -> list[list[str]]:
 
 
 def _drop_rows_after(path: Path, step: int | None) -> None:
-    rows = [] if step is None else [row for row in _complete_rows(path) if int(row[0]) <= step]
+    try:
+        rows = [] if step is None else [row for row in _complete_rows(path) if int(row[0]) <= step]
+    except ValueError as error:
+        raise ValueError(f"{path} is no curve ({error}); remove it and run again.") from None
     if rows:
         write_bytes(path, "".join(f"{row[0]},{row[1]}\n" for row in rows).encode())
     else:

@@ -23,7 +23,11 @@ def _refuse_other_options(folder: Path, config: Mapping[str, Any]) -> None:
     written = folder / "config.json"
     if not written.is_file():
         return
-    differ = differences(json.loads(written.read_text(encoding="utf-8")), config)
+    try:
+        there = dict(json.loads(written.read_text(encoding="utf-8")))
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{written} is damaged ({error}); remove {folder} and run again.") from None
+    differ = differences(there, config)
     if differ:
         raise ValueError(
             f"{folder} holds a run with other options ({differ}); name another output folder, or remove it."

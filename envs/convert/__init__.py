@@ -89,7 +89,7 @@ def convert(
     manifest = Manifest(source, options, digest(tasks), list(map(str, paths)))
     out.mkdir(parents=True, exist_ok=True)
     with _locked(out):
-        if not _resume(out, manifest):
+        if not (_resume(out, manifest) and _opens(out)):
             _make_missing(tasks, workers, out.name, show_progress)
             manifest = _completed(manifest, [path for task in tasks for path in task.paths()])
             write_card(out, manifest)
@@ -127,12 +127,21 @@ def _resume(out: Path, manifest: Manifest) -> bool:
     return before.complete
 
 
+def _opens(out: Path) -> bool:
+    """A finished conversion has all its shards; one that was lost or damaged since is made again."""
+    try:
+        SceneStore(out)
+    except SceneError:
+        return False
+    return True
+
+
 def _make_missing(tasks: Sequence[Task], workers: int, name: str, show: bool) -> None:
-    """Make the shards that are not there yet."""
+    """Make the shards that are not there yet, or are damaged."""
     seen: dict[str, tuple[str, int]] = {}
     missing, made = [], 0
     for task in tasks:
-        records = [read_record(path) for path in task.paths()]
+        records = list(_whole(task))
         made += sum(record.num_records for record in records)
         if records and records[-1].last:
             _check_ids(records, seen)
@@ -144,6 +153,16 @@ def _make_missing(tasks: Sequence[Task], workers: int, name: str, show: bool) ->
             records = [read_record(path) for path in task.paths()]
             _check_ids(records, seen)
             bar.total += sum(record.num_records for record in records) - task.num_expected
+
+
+def _whole(task: Task) -> Iterator[ShardRecord]:
+    """Records of a task's shards; a damaged one goes, and what comes after it counts as missing too."""
+    for path in list(task.paths()):
+        try:
+            yield read_record(path)
+        except SceneError:
+            path.unlink()
+            return
 
 
 def _check_ids(records: Sequence[ShardRecord], seen: dict[str, tuple[str, int]]) -> None:

@@ -66,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if ids:
             rows = zip(store.scene_ids, store.num_agents.tolist(), strict=True)
             sys.stdout.writelines(f"{index:>8}  {name}  {agents}\n" for index, (name, agents) in enumerate(rows))
-    except ValueError as error:
+    except (ValueError, OSError, ImportError) as error:
         sys.stderr.write(f"error: {error}\n")
         return BAD_INPUT_STATUS
     except KeyboardInterrupt:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import os
+import re
 import sys
 import time
 import warnings
@@ -22,6 +23,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from dpa.training.distributed import started_ranks
 from envs.allocator import keep_freed_memory
 from envs.options import differences
+from recipes.common.limits import check_limits
 
 CONFIG = {"version_base": "1.3", "config_path": str(Path(__file__).parents[1] / "config")}
 """Arguments of ``hydra.main`` that all recipes share; with an absolute path, ``main`` may also be imported."""
@@ -55,6 +57,7 @@ def ranked_recipe(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], 
     def run(cfg: DictConfig) -> None:
         warnings.filterwarnings("ignore", category=DeprecationWarning, module="torchrl")
         try:
+            check_limits(cfg)
             check_resources(cfg)
             main(cfg)
         except MissingMandatoryValue as error:
@@ -89,11 +92,15 @@ def interrupted() -> int:
 
 
 def check_resources(cfg: DictConfig) -> None:
-    """Set torch's threads and the allocator, and refuse a device that is not there, before any work.
+    """Set torch's threads and the allocator, and refuse what is not there or in the way, before any work.
 
     Raises:
-        ValueError: no such device.
+        ValueError: no such device, or a result that cannot be written because a folder has its name.
     """
+    if cfg.get("json") is not None and Path(cfg.json).is_dir():
+        raise ValueError(f"json={cfg.json} is a folder; name a file.")
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", str(cfg.device)):
+        raise ValueError(f"device must be cpu, cuda or cuda:N, got {cfg.device!r}.")
     torch.set_num_threads(cfg.threads)
     keep_freed_memory()
     if torch.device(cfg.device).type == "cuda" and not torch.cuda.is_available():

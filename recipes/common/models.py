@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 
 from dpa.policy import SIZES, ContextOptions, MotionLM, MotionLMConfig
 from dpa.tokens import MotionTokenizer, VerletTokenizer
-from dpa.training.checkpoint import load_policy, load_weights, save_policy
+from dpa.training.checkpoint import CheckpointError, load_policy, load_weights, save_policy
 from recipes.common.cli import build, plain
 
 TOKENIZERS = {"verlet": VerletTokenizer}
@@ -56,6 +56,18 @@ def build_tokenizer(section: Mapping[str, Any]) -> MotionTokenizer:
 def write_policy(path: Path, model: MotionLM, config: dict[str, Any], metadata: dict[str, Any]) -> None:
     """Save a policy with what it is and where it comes from."""
     save_policy(path, model.state_dict(), config, metadata)
+
+
+def check_written(path: Path) -> None:
+    """Refuse a finished training whose policy was damaged since.
+
+    Raises:
+        ValueError: it was; the message says how to have it trained again.
+    """
+    try:
+        load_policy(path)
+    except CheckpointError as error:
+        raise ValueError(f"{error} To train it again, remove {path.parent}.") from None
 
 
 def open_policy(path: str | Path, device: str = "cpu") -> tuple[MotionLM, ContextOptions, dict[str, Any]]:

@@ -33,13 +33,20 @@ class PartialResult:
         self._options = json.dumps(decided_by, sort_keys=True) + "\n"
 
     def read(self) -> dict[int, dict[str, Any]]:
-        """Entries of the scenes scored so far, by index; afterwards the file holds them and nothing else."""
+        """Entries of the scenes scored so far, by index; afterwards the file holds them and nothing else.
+
+        Raises:
+            ValueError: the file is damaged.
+        """
         lines = self.path.read_text(encoding="utf-8").splitlines(keepends=True) if self.path.is_file() else []
         same = lines[:1] == [self._options]
         whole = [line for line in lines[1:] if line.endswith("\n")] if same else []
         self.path.parent.mkdir(parents=True, exist_ok=True)
         write_bytes(self.path, "".join([self._options, *whole]).encode())
-        return dict(map(json.loads, whole))
+        try:
+            return {int(index): dict(entry) for index, entry in map(json.loads, whole)}
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{self.path} is damaged ({error}); remove it and run again.") from None
 
     def add(self, entries: dict[int, dict[str, Any]]) -> None:
         """Append entries; :meth:`read` comes first."""

@@ -13,29 +13,13 @@ from dpa.training.loggers import check_backend
 from recipes.alignment.candidates import check_data
 from recipes.alignment.losses import check_fit, make_loss
 from recipes.common.cli import check_steps, told_of
+from recipes.common.limits import check_limits
 from recipes.common.models import policy_config
 from recipes.common.rankings import build_distance, ranking_options
 from recipes.experiment.methods import read_setups
 
 CHECKPOINTS = ("last", "select", "all")
 """What becomes of the snapshots of an alignment: there are none, one of them may be chosen, or each is shown."""
-
-COUNTS = (
-    "collection.num_rollouts",
-    "decoding.num_rollouts",
-    "evaluation.num_rollouts",
-    "drift_rollouts",
-    "pictures.num_rollouts",
-    "pictures.kept",
-    "pretraining.batch_size",
-    "pretraining.tune_interval",
-    "alignment.scenes_per_step",
-    "alignment.pairs_per_scene",
-    "alignment.watch_interval",
-    "alignment.watch_scenes",
-    "alignment.watch_pairs",
-)
-"""Options that count something of which there must be one."""
 
 
 def check_experiment(cfg: DictConfig) -> None:
@@ -47,25 +31,17 @@ def check_experiment(cfg: DictConfig) -> None:
     Raises:
         ValueError: naming the option.
     """
+    check_limits(cfg)
     check_steps(cfg.pretraining, "pretraining")
     policy_config(cfg.model)
     RealismConfig.load(str(cfg.evaluation.metric))
     check_backend(cfg.logger.backend)
     if not cfg.seeds or len(set(cfg.seeds)) < len(cfg.seeds):
         raise ValueError(f"seeds must be one or more, each once, got {list(cfg.seeds)}.")
-    if cfg.aligned_scenes is not None and cfg.aligned_scenes < 1:
-        raise ValueError(f"aligned_scenes must be 1 or more, or null for all, got {cfg.aligned_scenes}.")
-    _check_counts(cfg)
     _check_decodings(cfg)
     _check_rankings(cfg)
     _check_methods(cfg)
     _check_report(cfg)
-
-
-def _check_counts(cfg: DictConfig) -> None:
-    for name in COUNTS:
-        if (count := OmegaConf.select(cfg, name)) < 1:
-            raise ValueError(f"{name} must be 1 or more, got {count}.")
 
 
 def _check_decodings(cfg: DictConfig) -> None:

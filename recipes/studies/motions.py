@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -142,9 +143,17 @@ class MotionShelf:
             np.savez(file, **{name: _small(value).numpy() for name, value in motions._asdict().items()})
 
     def get(self, scene: int) -> Motions:
-        """Read the motions of a scene."""
-        with np.load(self.folder / f"{scene}.npz", allow_pickle=False) as arrays:
-            parts = {name: torch.from_numpy(arrays[name]) for name in Motions._fields}
+        """Read the motions of a scene.
+
+        Raises:
+            ValueError: its file is damaged.
+        """
+        path = self.folder / f"{scene}.npz"
+        try:
+            with np.load(path, allow_pickle=False) as arrays:
+                parts = {name: torch.from_numpy(arrays[name]) for name in Motions._fields}
+        except (BadZipFile, EOFError, KeyError, ValueError) as error:
+            raise ValueError(f"{path} is damaged ({error}); remove it and run again.") from None
         return Motions(**{name: part if part.dtype == torch.bool else part.float() for name, part in parts.items()})
 
     def remove(self) -> None:

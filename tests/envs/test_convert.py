@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -138,6 +139,27 @@ def test_a_finished_conversion_is_only_opened(raw: Path, tmp_path: Path) -> None
     times = [path.stat().st_mtime_ns for path in sorted((tmp_path / "out").rglob("*"))]
     convert("womd", [raw], tmp_path / "out")
     assert [path.stat().st_mtime_ns for path in sorted((tmp_path / "out").rglob("*"))] == times
+
+
+@pytest.mark.parametrize("harm", ["cut", "removed"])
+def test_a_shard_that_was_lost_or_damaged_is_made_again(raw: Path, tmp_path: Path, harm: str) -> None:
+    out = tmp_path / "out"
+    convert("womd", [raw], out, shard_size=3)
+    before, shard = digests(out), out / "00001.scenes"
+    if harm == "cut":
+        shard.write_bytes(shard.read_bytes()[:-9])
+    else:
+        shard.unlink()
+    with pytest.raises(SceneError, match=r"00001\.scenes.*convert the scenes again"):
+        SceneStore(out)
+    convert("womd", [raw], out, shard_size=3)
+    assert digests(out) == before
+
+
+def test_a_folder_that_cannot_be_written_is_told(raw: Path, tmp_path: Path, capsys) -> None:
+    (tmp_path / "out").write_text("a file")
+    assert main(["womd", str(raw), str(tmp_path / "out")]) == 2
+    assert str(tmp_path / "out") in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_another_conversion_is_not_mixed_in(raw: Path, tmp_path: Path) -> None:
@@ -313,7 +335,9 @@ def test_killed_with_two_workers_and_resumed_with_one_gives_the_same_bytes(make_
 
 def convert_and_leave(inputs: list[Path], out: Path) -> int:
     """A process that converts, forked so that it starts at once; returns its number."""
-    child = os.fork()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12 warns of threads; ours are idle
+        child = os.fork()
     if child == 0:
         try:
             convert("womd", inputs, out, shard_size=3)

@@ -287,7 +287,7 @@ def test_scores_are_those_of_the_network_and_rates_those_of_the_events() -> None
         (["split=train"], "split=train ranks the scenes that the discriminator learns from"),
         (["training.held_out=1.5"], "training.held_out must lie between 0 and 1, got 1.5"),
         (["training.held_out=0.99"], "training.held_out=0.99 holds 6 of 6 scenes with controlled agents out"),
-        (["training.steps=0"], "training.steps must be a whole number of 1 or more, got 0"),
+        (["training.steps=0"], "training.steps must be 1 or more, got 0"),
         (["policies=[]"], "policies=.. names no policy"),
         (["sight.road=[sky]"], "unknown features .'sky'."),
         (["sight.stride=20"], "sight.stride must be 1 to 10"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -18,8 +18,11 @@ from envs.files import write_json
 from envs.sources.synthetic import straight_road
 from envs.store import SceneStore
 from recipes.common.cli import CONFIG, build, finished, recipe
+from recipes.common.limits import LIMITS, check_limits
 from recipes.common.models import TOKENIZERS, build_policy, policy_config
+from recipes.common.partial import PartialResult
 from recipes.common.scenes import fingerprint, open_splits
+from recipes.studies.motions import MotionShelf
 
 RECIPES = ("pretrain", "collect", "align", "evaluate", "play", "ladder", "tokens", "compare", "validity", "sensitivity")
 WITHOUT_POLICY = ("pretrain", "ladder", "tokens", "compare", "play", "validity", "sensitivity")
@@ -194,13 +197,13 @@ def test_options_that_make_no_sense_are_refused(
         ("scenes.source=wmod", ("wmod",)),
         ("scenes.select.min_agents=99", ("'min_agents': 99", "leaves none of the 8 scenes of scenes.train")),
         ("+scenes.select.lights=true", ("scenes.select has no option 'lights'", "has_lights")),
-        ("pretraining.augmentation.mirror=2", ("mirror is a probability and must lie in [0, 1], got 2",)),
+        ("pretraining.augmentation.mirror=2", ("pretraining.augmentation.mirror must be from 0 to 1, got 2",)),
         ("+pretraining.augmentation.flip=1", ("pretraining.augmentation has no option 'flip'",)),
         ("model.size=huge", ("model.size must be one of", "huge")),
         ("model.tokenizer.name=patches", ("model.tokenizer.name must be one of", "patches")),
         ("+model.context.depth=3", ("model.context has no option 'depth'",)),
         ("model.context.horizon=17", ("horizon * decision_steps must be at most 80 steps", "17 * 5")),
-        ("model.context.max_pieces=0", ("max_pieces must be positive, got 0",)),
+        ("model.context.max_pieces=0", ("model.context.max_pieces must be 1 or more, got 0",)),
         ("model.tokenizer.steps=10", ("has 10 poses and model.context.decision_steps=5", "must be equal")),
         ("logger.backend=paper", ("logger.backend must be csv, wandb or tensorboard, got 'paper'",)),
         ("seed=-1", ("seed must lie in", "-1")),
@@ -245,6 +248,88 @@ def test_scenes_of_equal_ids_and_other_content_are_other_scenes(tmp_path: Path, 
     assert first.scene_ids == shards.scene_ids == other.scene_ids
     assert fingerprint(first) == fingerprint(shards) != fingerprint(other)
     assert fingerprint(first.subset([0])) == fingerprint(other.subset([0]))
+
+
+@pytest.mark.parametrize(
+    ("recipe", "option", "told"),
+    [
+        ("pretrain", "pretraining.max_norm=-1", "pretraining.max_norm must be above 0, got -1"),
+        ("pretrain", "pretraining.tune_interval=0", "pretraining.tune_interval must be 1 or more, got 0"),
+        ("pretrain", "pretraining.noise=1.5", "pretraining.noise must be from 0 to 1, got 1.5"),
+        ("pretrain", "pretraining.max_agents=0", "pretraining.max_agents must be 1 or more, got 0"),
+        ("pretrain", "model.context.arrivals=no", "model.context.arrivals must be true or false, got 'no'"),
+        ("pretrain", "scenes.limit=-1", "scenes.limit must be 1 or more, got -1"),
+        ("pretrain", "scenes.limit=abc", "scenes.limit must be a whole number or null, got 'abc'"),
+        ("pretrain", "threads=0", "threads must be 1 or more, got 0"),
+        ("pretrain", "device=gpu", "device must be cpu, cuda or cuda:N, got 'gpu'"),
+        ("align", "alignment.pairs_per_scene=0", "alignment.pairs_per_scene must be 1 or more, got 0"),
+        ("align", "alignment.lr=nan", "alignment.lr must be a number, got nan"),
+        ("align", "alignment.snapshots=[0]", "alignment.snapshots are steps from 1 on, got [0]"),
+        ("collect", "collection.decoding.top_k=1.5", "collection.decoding.top_k must be a whole number, got 1.5"),
+        ("collect", "collection.compile=abc", "collection.compile must be true or false, got 'abc'"),
+        ("collect", "seed=null", "seed must be a whole number, got None"),
+        ("evaluate", "evaluation.memory=2GB", "evaluation.memory must be a number, got '2GB'"),
+        ("evaluate", "decoding.temperature=inf", "decoding.temperature must be a number, got inf"),
+        ("evaluate", "json=FOLDER", "is a folder; name a file"),
+    ],
+)
+def test_a_value_that_an_option_cannot_have_is_told_before_any_work(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path, recipe: str, option: str, told: str
+) -> None:
+    given = {"policy": runs / "reference/policy.pt", "preferences": runs / "preferences", "output": tmp_path / "out"}
+    if recipe == "evaluate":
+        given |= {"json": tmp_path / "out.json"}
+    taken = {"pretrain": ("output",), "align": ("policy", "preferences", "output"), "collect": ("policy", "output")}
+    named = [f"{name}={given[name]}" for name in taken.get(recipe, ("policy", "json"))]
+    (tmp_path / "folder").mkdir()
+    wrong = option.replace("FOLDER", str(tmp_path / "folder"))
+    assert_refused(run(recipe, *options(recipe, *named, wrong)), told)
+    assert not list(tmp_path.glob("out*")), "the folder is not begun with it"
+
+
+def test_every_limit_is_that_of_an_option_and_holds_for_its_defaults() -> None:
+    seen = set()
+    for path in Path(CONFIG["config_path"]).glob("*.yaml"):
+        with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):
+            cfg = compose(path.stem)
+        check_limits(cfg)
+        seen |= {name for leaf in names_of(OmegaConf.to_container(cfg)) for name in (leaf.split(".")[-1], leaf)}
+    assert not {name for name in LIMITS if name not in seen and not any(leaf.endswith(f".{name}") for leaf in seen)}
+
+
+def names_of(section: dict, prefix: str = "") -> Iterator[str]:
+    for key, value in section.items():
+        yield from names_of(value, f"{prefix}{key}.") if isinstance(value, dict) else [f"{prefix}{key}"]
+
+
+def test_a_finished_policy_that_was_damaged_is_told(run: Callable, options: Callable, tmp_path: Path) -> None:
+    command = options("pretrain", f"output={tmp_path / 'reference'}", "pretraining.steps=2")
+    assert run("pretrain", *command).status == 0
+    (tmp_path / "reference/policy.pt").write_bytes(b"")
+    assert_refused(run("pretrain", *command), "policy.pt", f"To train it again, remove {tmp_path / 'reference'}")
+
+
+def test_damaged_options_of_a_run_are_told(run: Callable, options: Callable, tmp_path: Path) -> None:
+    (tmp_path / "reference").mkdir()
+    (tmp_path / "reference/config.json").write_text("null")
+    command = options("pretrain", f"output={tmp_path / 'reference'}", "pretraining.steps=2")
+    assert_refused(run("pretrain", *command), "config.json is damaged", "and run again")
+
+
+def test_damaged_partial_results_are_told(tmp_path: Path) -> None:
+    partial = PartialResult(tmp_path / "result.json", {})
+    partial.add({0: {"value": 1}})
+    with partial.path.open("a") as file:
+        file.write("[0, 1]\n")
+    with pytest.raises(ValueError, match=r"\.result\.json\.scored is damaged"):
+        partial.read()
+
+
+def test_damaged_motions_are_told(tmp_path: Path) -> None:
+    shelf = MotionShelf(tmp_path / "motions", {})
+    (tmp_path / "motions/3.npz").write_bytes(b"PK")
+    with pytest.raises(ValueError, match=r"3\.npz is damaged"):
+        shelf.get(3)
 
 
 def test_a_tokenizer_of_ones_own_has_the_options_of_its_class(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -187,11 +187,11 @@ def test_workers_fill_the_same_store_byte_for_byte(
     ("option", "message"),
     [
         ("collection.workers.count=2", "2 workers need backend=process or backend=ray"),
-        ("collection.memory=0", "memory must hold at least one agent, got 0 GiB"),
+        ("collection.memory=0", "collection.memory must be above 0, got 0"),
         ("collection.precision=float16", "precision must be one of float32, bfloat16, got 'float16'"),
         ("collection.num_rollouts=-1", "collection.num_rollouts must be 1 or more, got -1"),
         ("collection.ranking.kind=taste", "collection.ranking.kind must be one of .*, got 'taste'"),
-        ("collection.decoding.top_k=-1", "top_k must be 0 .all tokens. or more, got -1"),
+        ("collection.decoding.top_k=-1", "collection.decoding.top_k must be 0 or more, got -1"),
     ],
 )
 def test_a_wrong_option_is_told_before_a_store_is_begun(
@@ -837,6 +837,11 @@ def test_rollouts_of_some_policies_make_a_page_that_plays(
     assert outcome.status == 0, outcome.err
     text = page.read_text(encoding="utf-8")
     assert '"reference"' in text and '"other"' in text and "top-p 0.95" in text
+
+
+def test_a_page_to_play_needs_the_name_of_one(run: Callable, options: Callable, runs: Path, tmp_path: Path) -> None:
+    outcome = run("play", *options("play", f"policies={runs / 'reference/policy.pt'}", f"output={tmp_path / 'a.png'}"))
+    assert outcome.status == 2 and "name a file that ends in .html" in outcome.err
 
 
 def test_a_scene_to_play_that_is_not_there_is_told(

@@ -441,5 +441,11 @@ def test_the_command_writes_a_page_or_says_one_sentence(
     assert told.startswith("error: ") and told.count("\n") == 1 and "holds no results" in told
 
 
+def test_an_account_of_another_shape_is_told(copied: Path) -> None:
+    (copied / "stages.json").write_text('{"pretrain": [1, 2]}')
+    with pytest.raises(ValueError, match=r"stages\.json is no account of worker-seconds"):
+        read_study(copied)
+
+
 if __name__ == "__main__":
     pytest.main([__file__])
