@@ -84,7 +84,8 @@ def test_scenes_that_do_not_exist_are_told_by_path(
 ) -> None:
     more = [] if recipe in WITHOUT_POLICY else ["policy=none.pt"]
     more += {"play": ["policies=none.pt"], "compare": ["alignment.snapshots=[2]"]}.get(recipe, [])
-    command = options(recipe, *more, "scenes.train=nowhere", f"{output_of(recipe)}={tmp_path / 'out'}")
+    name = "out.html" if recipe == "play" else "out"
+    command = options(recipe, *more, "scenes.train=nowhere", f"{output_of(recipe)}={tmp_path / name}")
     assert_refused(run(recipe, *command), "nowhere")
 
 
