@@ -89,12 +89,13 @@ def convert(
     manifest = Manifest(source, options, digest(tasks), list(map(str, paths)))
     out.mkdir(parents=True, exist_ok=True)
     with _locked(out):
-        if not (_resume(out, manifest) and _opens(out)):
+        store = _opened(out) if _resume(out, manifest) else None
+        if store is None:
             _make_missing(tasks, workers, out.name, show_progress)
             manifest = _completed(manifest, [path for task in tasks for path in task.paths()])
             write_card(out, manifest)
             write_manifest(out, manifest)
-    store = SceneStore(out)
+            store = SceneStore(out)
     if (skipped := store.manifests[0].skipped) and not skip_bad:
         raise SceneError(f"{out}: was made without a bad input: {skipped[0]['error']}")
     return store
@@ -127,13 +128,12 @@ def _resume(out: Path, manifest: Manifest) -> bool:
     return before.complete
 
 
-def _opens(out: Path) -> bool:
-    """A finished conversion has all its shards; one that was lost or damaged since is made again."""
+def _opened(out: Path) -> SceneStore | None:
+    """A finished conversion; None where a shard was lost or damaged since and is to be made again."""
     try:
-        SceneStore(out)
+        return SceneStore(out)
     except SceneError:
-        return False
-    return True
+        return None
 
 
 def _make_missing(tasks: Sequence[Task], workers: int, name: str, show: bool) -> None:
