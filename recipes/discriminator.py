@@ -104,7 +104,7 @@ def measure_scene(
     tokenizer: MotionTokenizer,
     options: ContextOptions,
     distance: Distance,
-    metric: str,
+    metric: RealismConfig,
     seed: int,
 ) -> dict[str, Any]:
     """Scores of all rollouts and of the log, what was measured of them, and the realism of every ranking's quarters.
@@ -116,7 +116,7 @@ def measure_scene(
         tokenizer: of the policy.
         options: how the policy cuts scenes up.
         distance: the preference distance.
-        metric: year of the realism metric, or a YAML.
+        metric: the realism metric.
         seed: of the random groups.
     """
     motions, log = seen(each, sight, tokenizer, options)
@@ -149,13 +149,13 @@ def event_rates(each: Rolled) -> dict[str, Tensor]:
     return {"collision": touched, "offroad": off}
 
 
-def realism_of_quarters(each: Rolled, scores: dict[str, Tensor], metric: str, seed: int) -> dict[str, Any]:
+def realism_of_quarters(each: Rolled, scores: dict[str, Tensor], metric: RealismConfig, seed: int) -> dict[str, Any]:
     """Realism of the ``best`` and ``worst`` quarter of each ranking, and the mean over ``random`` groups of that size.
 
     Args:
         each: scene and rollouts.
         scores: ``[K]`` of each ranking, the best rollout with the highest; ties go to the smaller index.
-        metric: year of the realism metric, or a YAML.
+        metric: the realism metric.
         seed: of the random groups.
     """
     size = len(each.trajectories) // 4
@@ -180,7 +180,7 @@ def check(cfg: DictConfig) -> None:
     """Refuse options before any work.
 
     Raises:
-        ValueError: too few rollouts, a share that is none, a split that is trained on, or no such metric.
+        ValueError: too few rollouts, a share that is none, or a split that is trained on.
     """
     if cfg.num_rollouts < SMALLEST:
         raise ValueError(f"num_rollouts must be {SMALLEST} or more, got {cfg.num_rollouts}.")
@@ -188,7 +188,6 @@ def check(cfg: DictConfig) -> None:
         raise ValueError("split=train ranks the scenes that the discriminator learns from; say split=tune.")
     if not 0 < cfg.training.held_out < 1:
         raise ValueError(f"training.held_out must lie between 0 and 1, got {cfg.training.held_out}.")
-    RealismConfig.load(str(cfg.metric))
 
 
 @hydra.main(**CONFIG, config_name="discriminator")
@@ -196,6 +195,7 @@ def check(cfg: DictConfig) -> None:
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.discriminator``."""
     check(cfg)
+    metric = RealismConfig.load(str(cfg.metric))
     sight, distance = build(Sight, cfg.sight, "sight"), build_distance(cfg.ranking, "ranking")
     policies, splits = policies_of(cfg), open_splits(cfg.scenes)
     scenes, measured, training = splits[cfg.split], {}, {}
@@ -206,7 +206,7 @@ def main(cfg: DictConfig) -> None:
             "discriminator": weights_digest(net),
             "sight": plain(cfg.sight),
             "ranking": distance.describe(),
-            "metric": cfg.metric,
+            "metric": metric.describe(),
         }
         measure = partial(
             measure_scene,
@@ -215,7 +215,7 @@ def main(cfg: DictConfig) -> None:
             tokenizer=model.tokenizer,
             options=context,
             distance=distance,
-            metric=cfg.metric,
+            metric=metric,
             seed=cfg.seed,
         )
         measured[name] = study_policy(cfg, scenes, path, measure, decided_by, name)

@@ -81,7 +81,7 @@ def evaluate(
     decided_by = {
         "policy": weights_digest(model),
         "scenes": fingerprint(scenes),
-        "evaluation": deciding(options, "memory") | {"metric": [metric.name, metric.digest]},
+        "evaluation": deciding(options, "memory") | {"metric": metric.describe()},
         "ranking": distance.describe(),
         "decoding": asdict(decoding),
         "seed": seed,

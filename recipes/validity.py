@@ -27,7 +27,7 @@ from dpa.report.statistics import Interval, paired_bootstrap, summary
 from dpa.report.studies import plot_validity
 from envs.files import write_json
 from envs.seeding import make_generator
-from recipes.common.cli import CONFIG, finite, plain, recipe
+from recipes.common.cli import CONFIG, finite, recipe
 from recipes.common.rolled import Rolled
 from recipes.common.scenes import open_splits
 from recipes.studies.study import as_json, distances_of, how_made, over_scenes, shown, study
@@ -55,7 +55,7 @@ def windows(distance: Tensor, size: int, stride: int) -> list[Tensor]:
 
 
 def measure_scene(
-    each: Rolled, distances: dict[str, Distance], window: int, stride: int, metric: str, seed: int
+    each: Rolled, distances: dict[str, Distance], window: int, stride: int, metric: RealismConfig, seed: int
 ) -> dict[str, Any]:
     """Mean distance and realism of every window of every ranking, and of random groups.
 
@@ -64,7 +64,7 @@ def measure_scene(
         distances: rankings by name; displacement from the log is one more, ``ade``.
         window: rollouts of a window.
         stride: from one window to the next.
-        metric: year of the realism metric, or a YAML.
+        metric: the realism metric.
         seed: of the random groups.
     """
     rankings = {name: distance(each.scene, each.trajectories, each.controlled) for name, distance in distances.items()}
@@ -168,11 +168,20 @@ def main(cfg: DictConfig) -> None:
         raise ValueError("rankings is empty: there is nothing to compare with the ADE; name at least one distance.")
     if cfg.against not in (*distances, ADE):
         raise ValueError(f"against must be one of {', '.join((*distances, ADE))}, got {cfg.against!r}.")
-    RealismConfig.load(str(cfg.metric))
+    metric = RealismConfig.load(str(cfg.metric))
     scenes = open_splits(cfg.scenes)[cfg.split]
-    options = {key: plain(cfg)[key] for key in ("window", "stride", "metric")}
-    decided_by = options | {"rankings": {name: distance.describe() for name, distance in distances.items()}}
-    measured = study(cfg, scenes, lambda each: measure_scene(each, distances, seed=cfg.seed, **options), decided_by)
+    decided_by = {
+        "window": cfg.window,
+        "stride": cfg.stride,
+        "metric": metric.describe(),
+        "rankings": {name: distance.describe() for name, distance in distances.items()},
+    }
+    measured = study(
+        cfg,
+        scenes,
+        lambda each: measure_scene(each, distances, cfg.window, cfg.stride, metric, cfg.seed),
+        decided_by,
+    )
     found, paired = summarise(measured), compare_with(measured, cfg.against)
     folder = Path(cfg.output)
     plot_validity(found, folder / "validity.png")

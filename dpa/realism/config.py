@@ -157,6 +157,15 @@ class RealismConfig:
         del content["name"]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
+    def describe(self) -> list[str]:
+        """Name and :attr:`digest`: which metric a kept result is of.
+
+        Examples:
+            >>> RealismConfig.load("2024").describe()[0]
+            '2024'
+        """
+        return [self.name, self.digest]
+
     def replace(self, **changes: Any) -> RealismConfig:
         """A copy with some attributes changed."""
         return dataclasses.replace(self, **changes)

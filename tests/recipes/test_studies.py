@@ -13,6 +13,7 @@ import torch
 from hydra import compose, initialize_config_dir
 
 from dpa.realism import realism
+from dpa.realism.config import FOLDER
 from recipes import validity
 from recipes.common.cli import CONFIG
 from recipes.common.models import build_policy, policy_config, write_policy
@@ -133,6 +134,10 @@ def test_a_finished_study_is_read_back_and_a_killed_one_goes_on(
     assert run("validity", *command).status == 0
     other = run("validity", *command, "stride=2")
     assert other.status == 2 and "was written with other options ('stride'" in other.err
+    mine = tmp_path / "2024.yaml"
+    mine.write_text((FOLDER / "2024.yaml").read_text().replace("corner_rounding: 0.7", "corner_rounding: 0.5"))
+    other = run("validity", *command, f"metric={mine}")
+    assert other.status == 2 and "was written with other options ('metric'" in other.err, "of the same name"
 
 
 @pytest.mark.parametrize(
