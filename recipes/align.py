@@ -97,8 +97,6 @@ def align(
         "preferences": asdict(store.provenance),
         "expert": None if played is None else asdict(played.provenance),
     }
-    if any(step < 1 for step in options.snapshots):
-        raise ValueError(f"alignment.snapshots are steps from 1 on, got {list(options.snapshots)}.")
     snapshots = {step: folder / f"step_{step}" / "policy.pt" for step in options.snapshots if step <= options.steps}
     if ranks.agree(finished(result, decided_by) is not None and path.is_file(), "finished =", folder):
         check_kept(snapshots, options.steps)

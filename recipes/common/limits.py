@@ -13,11 +13,13 @@ class Limit(NamedTuple):
     """Values that an option may have.
 
     Attributes:
-        kind: ``int`` (a whole number), ``float`` (any finite number) or ``bool``.
+        kind: ``int`` (a whole number), ``float`` (any finite number), ``bool``, ``str``, ``list``, or ``dict`` (a
+            section).
         least: smallest value.
         most: largest value.
         above: the smallest value itself is not among them.
         empty: null is.
+        many: it is a list, and these hold for each of its members.
     """
 
     kind: type
@@ -25,6 +27,7 @@ class Limit(NamedTuple):
     most: float = math.inf
     above: bool = False
     empty: bool = False
+    many: bool = False
 
 
 COUNT, NUMBER = Limit(int, least=1), Limit(int, least=0)
@@ -33,21 +36,42 @@ COUNTS = (
     *("threads", "count", "parts", "shard_size", "chunk_scenes", "num_rollouts", "drift_rollouts", "kept", "each"),
     *("steps", "batch_size", "batch_scenes", "scenes_per_step", "pairs_per_scene", "max_rows", "stride", "width"),
     *("checkpoint_interval", "tune_interval", "watch_interval", "look_interval", "watch_scenes", "watch_pairs"),
-    *("decision_steps", "horizon", "max_controlled", "max_pieces", "patience", "pretraining.max_agents"),
+    *("decision_steps", "horizon", "max_controlled", "max_pieces", "patience", "pretraining.max_agents", "window"),
 )
+BINS = ("bins.vehicle", "bins.pedestrian", "bins.cyclist")
 LIMITS: dict[str, Limit] = {
     **dict.fromkeys(COUNTS, COUNT),
     **dict.fromkeys(("workers", "warmup", "part", "top_k", "min_agents", "pictures.scenes"), NUMBER),
-    **dict.fromkeys(("aligned_scenes", "scenes.limit", "select.max_agents"), COUNT._replace(empty=True)),
+    **dict.fromkeys(
+        ("aligned_scenes", "scenes.limit", "select.max_agents", "submission_shards"), COUNT._replace(empty=True)
+    ),
     **dict.fromkeys(("seed", "split_seed"), Limit(int)),
-    **dict.fromkeys(("memory", "max_norm", "lr", "piece_length", "temperature", "top_p"), POSITIVE),
+    **dict.fromkeys(("memory", "max_norm", "lr", "length", "piece_length", "temperature", "top_p"), POSITIVE),
     **dict.fromkeys(("noise", "dropout", "mirror", "agent_drop", "label_smoothing"), SHARE),
     **dict.fromkeys(("weight_decay", "rotation"), Limit(float, least=0)),
-    **dict.fromkeys(("compile", "arrivals", "tokenized"), FLAG),
+    **dict.fromkeys(("loss.alpha", "loss.cloning", "loss.conservative", "margin"), Limit(float)),
+    **dict.fromkeys(("held_out", "solver.window"), Limit(float)),
+    **dict.fromkeys(("compile", "arrivals", "tokenized", "loss.reference"), FLAG),
+    **dict.fromkeys(("output", "policy", "preferences"), Limit(str)),
+    **dict.fromkeys(("show", "years"), Limit(list)),
+    **dict.fromkeys(("rankings", "bins", "tokenizer", "setup", "labels", "published"), Limit(dict)),
+    **dict.fromkeys(BINS, POSITIVE._replace(many=True)),
+    "grid": Limit(float, many=True),
     "has_lights": FLAG._replace(empty=True),
+    "rankings_per_scene": Limit(float, empty=True),
+    "seeds": Limit(int, many=True),
+    "snapshots": COUNT._replace(many=True),
 }
 """Limit of an option by its last name, or by its last two where one name has several meanings."""
-WORDS = {int: "a whole number", float: "a number", bool: "true or false"}
+WORDS = {
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    str: "text",
+    list: "a list",
+    dict: "a section",
+}
+LISTS = {int: "a list of whole numbers", float: "a list of numbers"}
 
 
 def check_limits(cfg: DictConfig) -> None:
@@ -68,21 +92,35 @@ def check_limits(cfg: DictConfig) -> None:
         Traceback (most recent call last):
         ...
         ValueError: evaluation.memory must be a number, got '2GB'.
+        >>> check_limits(OmegaConf.create({"alignment": {"snapshots": [40, 0]}}))
+        Traceback (most recent call last):
+        ...
+        ValueError: alignment.snapshots must be 1 or more, got 0.
     """
     for name, value in _leaves(OmegaConf.to_container(cfg, resolve=False)):
         parts = name.split(".")
         limit = LIMITS.get(".".join(parts[-2:])) or LIMITS.get(parts[-1])
-        reference = isinstance(value, str) and value.startswith(("${", "???"))
-        if limit is not None and not reference and (wanted := _misfit(value, limit)) is not None:
-            raise ValueError(f"{name} must be {wanted}, got {value!r}.")
+        if limit is None:
+            continue
+        if limit.many and not isinstance(value, list):
+            raise ValueError(f"{name} must be {LISTS[limit.kind]}, got {value!r}.")
+        for each in _members(value) if limit.many else [value]:
+            reference = isinstance(each, str) and each.startswith(("${", "???"))
+            if not reference and (wanted := _misfit(each, limit)) is not None:
+                raise ValueError(f"{name} must be {wanted}, got {each!r}.")
 
 
 def _leaves(section: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     for key, value in section.items():
-        if isinstance(value, dict):
-            yield from _leaves(value, f"{prefix}{key}.")
-        else:
+        if not isinstance(value, dict):
             yield f"{prefix}{key}", value
+        elif key != "labels":  # named after methods, not options
+            yield from _leaves(value, f"{prefix}{key}.")
+
+
+def _members(values: list) -> Iterator[Any]:
+    for value in values:
+        yield from _members(value) if isinstance(value, list) else [value]
 
 
 def _misfit(value: Any, limit: Limit) -> str | None:
@@ -92,7 +130,7 @@ def _misfit(value: Any, limit: Limit) -> str | None:
     number = type(value) is int or (type(value) is float and math.isfinite(value))
     if not (number if limit.kind is float else type(value) is limit.kind):
         return WORDS[limit.kind] + (" or null" if limit.empty else "")
-    if limit.kind is bool:
+    if limit.kind not in (int, float):
         return None
     if limit.above and value <= limit.least:
         return f"above {limit.least:g}"

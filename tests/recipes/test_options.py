@@ -265,7 +265,12 @@ def test_scenes_of_equal_ids_and_other_content_are_other_scenes(tmp_path: Path, 
         ("pretrain", "device=gpu", "device must be cpu, cuda or cuda:N, got 'gpu'"),
         ("align", "alignment.pairs_per_scene=0", "alignment.pairs_per_scene must be 1 or more, got 0"),
         ("align", "alignment.lr=nan", "alignment.lr must be a number, got nan"),
-        ("align", "alignment.snapshots=[0]", "alignment.snapshots are steps from 1 on, got [0]"),
+        ("align", "alignment.snapshots=[0]", "alignment.snapshots must be 1 or more, got 0"),
+        ("align", "alignment.snapshots=5", "alignment.snapshots must be a list of whole numbers, got 5"),
+        ("align", "method.loss.alpha=abc", "method.loss.alpha must be a number, got 'abc'"),
+        ("pretrain", "output=3", "output must be text, got 3"),
+        ("pretrain", "model.tokenizer=abc", "model.tokenizer must be a section, got 'abc'"),
+        ("pretrain", "model.tokenizer.bins.vehicle=[0.1,abc]", "bins.vehicle must be a number, got 'abc'"),
         ("collect", "collection.decoding.top_k=1.5", "collection.decoding.top_k must be a whole number, got 1.5"),
         ("collect", "collection.compile=abc", "collection.compile must be true or false, got 'abc'"),
         ("collect", "seed=null", "seed must be a whole number, got None"),
@@ -289,18 +294,23 @@ def test_a_value_that_an_option_cannot_have_is_told_before_any_work(
 
 
 def test_every_limit_is_that_of_an_option_and_holds_for_its_defaults() -> None:
-    seen = set()
-    for path in Path(CONFIG["config_path"]).glob("*.yaml"):
+    seen, folder = set(), Path(CONFIG["config_path"])
+    experiments = [("compare", [f"experiment={path.stem}"]) for path in (folder / "experiment").glob("*.yaml")]
+    for name, chosen in [*((path.stem, []) for path in folder.glob("*.yaml")), *experiments]:
+        if chosen == ["experiment=base"]:
+            continue
         with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):
-            cfg = compose(path.stem)
+            cfg = compose(name, chosen)
         check_limits(cfg)
-        seen |= {name for leaf in names_of(OmegaConf.to_container(cfg)) for name in (leaf.split(".")[-1], leaf)}
-    assert not {name for name in LIMITS if name not in seen and not any(leaf.endswith(f".{name}") for leaf in seen)}
+        seen |= set(names_of(OmegaConf.to_container(cfg)))
+    assert not {name for name in LIMITS if not any(f".{option}".endswith(f".{name}") for option in seen)}
 
 
 def names_of(section: dict, prefix: str = "") -> Iterator[str]:
     for key, value in section.items():
-        yield from names_of(value, f"{prefix}{key}.") if isinstance(value, dict) else [f"{prefix}{key}"]
+        yield f"{prefix}{key}"
+        if isinstance(value, dict):
+            yield from names_of(value, f"{prefix}{key}.")
 
 
 def test_a_finished_policy_that_was_damaged_is_told(run: Callable, options: Callable, tmp_path: Path) -> None:
