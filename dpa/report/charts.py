@@ -193,7 +193,7 @@ def _dot(colour: str | list[str], *, hollow: bool) -> dict[str, Any]:
 
 def curves(
     content: Sequence[Line], title: str, *, x: str, y: str, caption: str = "", log_x: bool = False, zero: bool = False,
-    height: int = 360,
+    nonnegative: bool = False, height: int = 360,
 ) -> Chart:  # fmt: skip
     """Lines over an axis, with bands, error bars and markers where a line has them.
 
@@ -205,6 +205,7 @@ def curves(
         caption: below the figure.
         log_x: the axis is logarithmic.
         zero: y = 0 is marked.
+        nonnegative: y cannot be below 0, so the axis is not either, also where all values are 0.
         height: without the legend [pixels].
     """
     figure = go.Figure()
@@ -223,7 +224,13 @@ def curves(
     figure.update_layout(
         _layout(named),
         xaxis={**_axis(x), **(places if log_x else {})},
-        yaxis={**_axis(y), "zeroline": zero, "zerolinecolor": QUIET, "zerolinewidth": 1},
+        yaxis={
+            **_axis(y),
+            "zeroline": zero,
+            "zerolinecolor": QUIET,
+            "zerolinewidth": 1,
+            "rangemode": "nonnegative" if nonnegative else "normal",
+        },
         hovermode="closest",
     )
     return Chart(figure, title, caption, height + (LEGEND_HEIGHT * math.ceil(named / 3) if named > 1 else 0))

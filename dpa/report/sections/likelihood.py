@@ -135,7 +135,8 @@ def training_section(
     if not parts:
         return None
     about = hint(
-        "Figures 4 and 6 of the paper: negative log-likelihood of ranked rollouts of the tuning scenes along training. "
+        "Figures 4 and 6 of the paper: negative log-likelihood (NLL) of ranked rollouts and logs of the tuning scenes "
+        "along training, minus that at the start; below 0 they have become likelier. "
         f"Thin lines are seeds, thick ones their mean; curves of more than {POINTS} points are averaged over blocks of "
         "steps (seed_N/METHOD/scalars/). "
         "Each figure has a scale of its own."
@@ -144,8 +145,16 @@ def training_section(
 
 
 def _likelihood(label: str, seeds: Sequence[Mapping[str, Curve]]) -> list[Chart]:
-    content = [line for key, (name, colour) in SIDES.items() for line in _lines(name, key, seeds, colour)]
-    return [curves(content, label, x="step", y="negative log-likelihood", height=250)] if content else []
+    changes = [{key: _since_start(run[key]) for key in SIDES if key in run} for run in seeds]
+    content = [line for key, (name, colour) in SIDES.items() for line in _lines(name, key, changes, colour)]
+    return (
+        [curves(content, label, x="step", y="change of NLL [nats per token]", zero=True, height=250)] if content else []
+    )
+
+
+def _since_start(curve: Curve) -> Curve:
+    """Runs start where their references are, and these lie further apart than training moves them."""
+    return {"step": curve["step"], "value": [value - curve["value"][0] for value in curve["value"]]}
 
 
 def _health(
@@ -158,7 +167,7 @@ def _health(
         for line in _lines(experiment.labels[method], key, seeds, colours[method])
     ]
     title, axis = HEALTH[key]
-    return [curves(content, title, x="step", y=axis, height=260)] if content else []
+    return [curves(content, title, x="step", y=axis, nonnegative=True, height=260)] if content else []
 
 
 def _lines(name: str, key: str, seeds: Sequence[Mapping[str, Curve]], colour: str) -> list[Line]:

@@ -249,10 +249,11 @@ def test_likelihood_along_training_has_a_line_for_each_seed_and_their_mean(page:
     figure = figures(page, "step")[0]
     lines = [each for each in figure["data"] if each["name"] == "preferred"]
     assert [each["line"]["width"] for each in lines] == [1, 1, 1, 2.6]
-    assert lines[0]["y"][-1] == pytest.approx(1.8) and lines[3]["y"][-1] == pytest.approx(1.82)
+    assert {line["y"][0] for line in lines} == {0} and lines[0]["x"][-1] == 60
+    assert lines[0]["y"][-1] == pytest.approx(-0.3) and lines[3]["y"][-1] == pytest.approx(-0.3)
     shown = {figure["layout"]["yaxis"]["title"]["text"] for figure in figures(page, "step")}
     assert shown == {
-        "negative log-likelihood", "standard deviation of the logits", "share of pairs", "KL per token [nats]",
+        "change of NLL [nats per token]", "standard deviation of the logits", "share of pairs", "KL per token [nats]",
         "entropy per token [nats]",
     }  # fmt: skip
 
