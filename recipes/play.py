@@ -1,9 +1,10 @@
-"""Look at what policies do: a page that plays some scenes, log beside rollouts.
+"""Look at what policies do: a page that plays some scenes, log beside rollouts, or a picture of the most likely ones.
 
     python -m recipes.play policies=[runs/pretrain/policy.pt,runs/dpa_omf/policy.pt]
+    python -m recipes.play policies=[runs/pretrain/policy.pt,runs/dpa_omf/policy.pt] output=runs/likely.png
 
 Of many rollouts of each scene and policy the page keeps a few: the most likely one, and some from the one nearest to
-the log to the farthest.
+the log to the farthest. The picture shows the most likely ones alone (figures 5 and 9 of the paper).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from torch import Tensor
 from dpa.policy import Decoding
 from dpa.ranking import Distance, PreferenceDistance
 from dpa.report.judged import JudgedRollouts, judge_rollouts
+from dpa.report.likely import plot_likely
 from dpa.report.page import write_rollouts
 from dpa.report.player import PlayerScene
 from dpa.rollout import make_collector
@@ -135,8 +137,8 @@ def chosen_scenes(scenes: SceneStore, chosen: Sequence[int | str]) -> list[int]:
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.play``."""
-    if Path(cfg.output).suffix != ".html":
-        raise ValueError(f"output={cfg.output} is to be a page; name a file that ends in .html.")
+    if Path(cfg.output).suffix not in (".html", ".png"):
+        raise ValueError(f"output={cfg.output} is to be a page or a picture; name a file that ends in .html or .png.")
     policies = policies_of(cfg)
     scenes = open_splits(cfg.scenes)[cfg.split]
     players = roll_out(
@@ -150,6 +152,10 @@ def main(cfg: DictConfig) -> None:
         seed=cfg.seed,
         device=cfg.device,
     )
+    if Path(cfg.output).suffix == ".png":
+        plot_likely(players, cfg.output)
+        print(f"picture: {cfg.output}")
+        return
     facts = {name: str(path) for name, path in policies.items()} | {
         "decoding": f"top-p {cfg.decoding.top_p:g}, temperature {cfg.decoding.temperature:g}, seed {cfg.seed}",
         "rollouts": f"{cfg.num_rollouts} of each scene; {cfg.kept} from the nearest to the farthest, and the likeliest",

@@ -2,30 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.lines import Line2D
 from torch import Tensor
 
 from dpa.ranking import log_trajectory, occupancy_features, rank_of
 from dpa.report.canvas import INK, blank_figure, save_figure
-from dpa.report.coupling import LOG_COLOR
-from envs.render import draw_agents, draw_map, draw_trails, fit_view, frame_view, pose_tracks
-from envs.render.picture import legend_handles
-from envs.scene import CURRENT_STEP, Scene
-
-MARKS = {"collision": ("X", "#000000"), "off road": ("v", "#f0b400")}
-"""Marker and colour; shape repeats what colour says."""
-PANEL = 2.55
-"""Side of the picture of a rollout [inches]."""
-LEGEND_ENTRY = 1.45
-"""Width of an entry of the legend [inches]."""
-LOG_PATH = {"color": LOG_COLOR, "lw": 0.8, "ls": (0, (2, 1.5))}
+from dpa.report.panels import PANEL, draw_legend, draw_log_paths, draw_marks, draw_panel, first_new
+from envs.render import pose_tracks
+from envs.scene import Scene
 
 
 class Incidents(NamedTuple):
@@ -57,10 +44,8 @@ def incidents(scene: Scene, trajectories: Tensor, agents: Tensor) -> Incidents:
     """
     both = torch.cat((trajectories, log_trajectory(scene, trajectories.shape[2])[None].to(trajectories)))
     phi, valid = occupancy_features(scene, both, ("collision", "road_edge"), ego=agents)
-    happens = (phi > 0) & valid[..., None]
-    new = happens[:-1] & ~happens[-1:].any(2, keepdim=True)
-    first = torch.where(new.any(2), new.int().argmax(2), -1)
-    return Incidents(*first.unbind(-1))
+    happens = ((phi > 0) & valid[..., None]).unbind(-1)
+    return Incidents(*(first_new(each[:-1], each[-1].any(-1)) for each in happens))
 
 
 def plot_ranked(
@@ -85,59 +70,19 @@ def plot_ranked(
     order = rank.argsort()
     chosen = torch.cat((order[:each], order[-each:]))
     found = incidents(scene, trajectories[chosen], agents)
-    width = PANEL * (each + 2) + 0.4
-    figure = blank_figure(width, PANEL * 2 + 1.35)
+    figure = blank_figure(PANEL * (each + 2) + 0.4, PANEL * 2 + 1.35)
     grid = figure.add_gridspec(2, each + 2)
     log = figure.add_subplot(grid[:, :2])
-    _panel(log, scene, pose_tracks(scene), "log")
+    driven = pose_tracks(scene)
+    draw_panel(log, scene, driven, "log")
     for position, k in enumerate(chosen.tolist()):
         axes = figure.add_subplot(grid[position // each, 2 + position % each])
         tracks = pose_tracks(scene, trajectories[k])
         title = f"rank {int(rank[k])}: distance {float(distance[k]):.2f} (rollout {k})"
-        _panel(axes, scene, tracks, title)
-        _log_paths(axes, scene)
-        for first, (marker, color) in zip(found, MARKS.values(), strict=True):
-            _mark(axes, trajectories[k, agents], first[position], marker, color)
-    handles = [*legend_handles(scene), Line2D([], [], **LOG_PATH, label="path in the log"), *_marks(found)]
-    rows = math.ceil(len(handles) * LEGEND_ENTRY / width)
-    figure.legend(
-        handles=handles,
-        loc="outside lower center",
-        ncols=math.ceil(len(handles) / rows),
-        frameon=False,
-        fontsize=8.5,
-        labelcolor=INK,
-    )
+        draw_panel(axes, scene, tracks, title)
+        draw_log_paths(axes, scene, driven)
+        draw_marks(axes, trajectories[k, agents], [first[position] for first in found])
+    draw_legend(figure, [scene], [bool((first >= 0).any()) for first in found])
     text = f"scene {scene.scene_id}: of {len(distance)} rollouts, the nearest to the log above and the farthest below"
     figure.suptitle(text, fontsize=10.5, color=INK)
     save_figure(figure, path)
-
-
-def _panel(axes: Axes, scene: Scene, tracks: Tensor, title: str) -> None:
-    frame_view(axes, fit_view(scene, margin=10.0, smallest=25.0, largest=60.0))  # the panels are small
-    draw_map(axes, scene)
-    draw_trails(axes, scene, tracks, CURRENT_STEP, tracks.shape[1] - 1, alpha=1.0, width=1.5)
-    draw_agents(axes, scene, tracks, CURRENT_STEP)
-    axes.set_title(title, fontsize=8.5, color=INK)
-
-
-def _log_paths(axes: Axes, scene: Scene) -> None:
-    """Where the agents of the rollout went in the log."""
-    paths = pose_tracks(scene)[scene.agents.present, CURRENT_STEP:, :2].numpy()
-    axes.add_collection(LineCollection(paths, colors=LOG_COLOR, linewidths=0.7, linestyles=(0, (2, 1.5)), zorder=8))
-
-
-def _mark(axes: Axes, poses: Tensor, first: Tensor, marker: str, color: str) -> None:
-    """Mark where each agent (``[E, T, 4]``) is at a step (``[E]``, -1 for none)."""
-    there = first >= 0
-    x, y = poses[there, first[there], :2].T.numpy()
-    axes.scatter(x, y, s=34, marker=marker, color=color, edgecolors="white", lw=0.8, zorder=15)
-
-
-def _marks(found: Incidents) -> list[Line2D]:
-    """Legend of the marks that are used."""
-    return [
-        Line2D([], [], marker=marker, ls="", ms=7, mec="white", mfc=color, label=f"{name}, not in the log")
-        for first, (name, (marker, color)) in zip(found, MARKS.items(), strict=True)
-        if bool((first >= 0).any())
-    ]

@@ -1,4 +1,4 @@
-"""Scenes and rollouts of an experiment's policies for the player of the page (figures 5, 8 and 9 of the paper)."""
+"""Scenes and rollouts of an experiment's policies, to play on the page and as a picture (figures 5, 8 and 9)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import asdict
 from omegaconf import DictConfig
 
 from dpa.report.experiment import read_json
+from dpa.report.likely import plot_likely
 from dpa.report.player import pack_players
 from envs.files import write_json
 from envs.store import SceneStore
@@ -42,7 +43,7 @@ def write_players(cfg: DictConfig, scenes: SceneStore, chosen: Mapping[str, Run]
         "options": plain(options),
         "seed": seed,
     }
-    if runs.players.is_file() and read_json(runs.players).get("options") == decided_by:
+    if runs.likely.is_file() and runs.players.is_file() and read_json(runs.players).get("options") == decided_by:
         return
     players = roll_out(
         {named[method]: path for method, path in files.items()},
@@ -55,4 +56,5 @@ def write_players(cfg: DictConfig, scenes: SceneStore, chosen: Mapping[str, Run]
         seed=seed,
         device=cfg.device,
     )
+    plot_likely(players, runs.likely)
     write_json(runs.players, pack_players(players) | {"options": decided_by})

@@ -83,6 +83,11 @@ class RunFolder:
         """Scenes and rollouts to play."""
         return self.root / "players.json"
 
+    @property
+    def likely(self) -> Path:
+        """Picture of the most likely rollout of each policy in these scenes."""
+        return self.root / "likely.png"
+
     def relative(self, path: Path) -> str:
         """A path as results name it."""
         return path.relative_to(self.root).as_posix()

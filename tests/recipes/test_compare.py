@@ -97,6 +97,7 @@ def test_the_page_shows_methods_and_scenes(finished: Path) -> None:
     assert "DPA-OMF" in page and "plotly" in page.lower() and "player" in page
     players = json.loads((finished / "players.json").read_text())
     assert set(players["scenes"][0]["rollouts"]) == set(experiment(finished)["labels"].values())
+    assert (finished / "likely.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize("name", [name for name in known_experiments() if name != "methods"])

@@ -839,9 +839,16 @@ def test_rollouts_of_some_policies_make_a_page_that_plays(
     assert '"reference"' in text and '"other"' in text and "top-p 0.95" in text
 
 
+def test_the_most_likely_rollouts_make_a_picture(run: Callable, options: Callable, runs: Path, tmp_path: Path) -> None:
+    command = options("play", f"policies={runs / 'reference/policy.pt'}", "show=[1]", "num_rollouts=2")
+    outcome = run("play", *command, f"output={tmp_path / 'likely.png'}")
+    assert outcome.status == 0, outcome.err
+    assert (tmp_path / "likely.png").stat().st_size > 10_000
+
+
 def test_a_page_to_play_needs_the_name_of_one(run: Callable, options: Callable, runs: Path, tmp_path: Path) -> None:
-    outcome = run("play", *options("play", f"policies={runs / 'reference/policy.pt'}", f"output={tmp_path / 'a.png'}"))
-    assert outcome.status == 2 and "name a file that ends in .html" in outcome.err
+    outcome = run("play", *options("play", f"policies={runs / 'reference/policy.pt'}", f"output={tmp_path / 'a.svg'}"))
+    assert outcome.status == 2 and "name a file that ends in .html or .png" in outcome.err
 
 
 def test_a_scene_to_play_that_is_not_there_is_told(

@@ -8,15 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from matplotlib.collections import PathCollection
-from matplotlib.colors import to_rgba
 from torch import Tensor
 
 from dpa.ranking import log_trajectory
-from dpa.report import ranked
 from dpa.report.ranked import incidents, plot_ranked
 from envs.scene import Scene
 from envs.sources.synthetic import straight_road, two_cars_head_on
+from tests.dpa.report.drawings import marks
 
 EVERYBODY = torch.tensor([0, 1])
 
@@ -35,13 +33,6 @@ def rollouts(scene: Scene) -> Tensor:
     away[0, :, 1] -= torch.linspace(0, 30, 80)
     slow[0, :, 0] -= torch.linspace(0, 2, 80)
     return torch.stack((log, stopped, away, slow))
-
-
-def marks(axes: Any, color: str) -> np.ndarray:
-    """Where markers of one colour stand: ``[n, 2]``."""
-    found = [c for c in axes.collections if isinstance(c, PathCollection) and len(c.get_offsets())]
-    of_color = [c.get_offsets() for c in found if np.allclose(c.get_facecolor()[0], to_rgba(color))]
-    return np.concatenate(of_color) if of_color else np.zeros((0, 2))
 
 
 def test_the_first_collision_and_the_first_step_off_the_road_are_found(scene: Scene, rollouts: Tensor) -> None:
@@ -81,12 +72,11 @@ def test_marks_stand_where_things_happen_and_only_there(
 ) -> None:
     plot_ranked(scene, rollouts, torch.tensor([0.0, 9.0, 5.0, 1.0]), EVERYBODY, tmp_path / "r.png", each=2)
     found = incidents(scene, rollouts, EVERYBODY)
-    crash, away = (color for _, color in ranked.MARKS.values())
-    collisions = [marks(axes, crash) for axes in drawn[0].axes]
+    collisions = [marks(axes, "collision") for axes in drawn[0].axes]
     assert [len(points) for points in collisions] == [0, 0, 0, 0, 2]
     at = int(found.collision[1, 0])
     np.testing.assert_allclose(collisions[-1], rollouts[1, :, at, :2], rtol=1e-6)
-    assert [len(marks(axes, away)) for axes in drawn[0].axes] == [0, 0, 0, 1, 0]
+    assert [len(marks(axes, "off road")) for axes in drawn[0].axes] == [0, 0, 0, 1, 0]
     legend = [text.get_text() for text in drawn[0].legends[0].get_texts()]
     assert {"path in the log", "collision, not in the log", "off road, not in the log"} < set(legend)
 
