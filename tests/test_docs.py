@@ -262,7 +262,8 @@ def study(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 def test_the_tables_of_the_results_are_those_of_the_studies_beside_them(study: Study) -> None:
     told = (REPOSITORY / "docs" / "results.md").read_text(encoding="utf-8")
     for experiment in study.experiments.values():
-        for comparison in (experiment.own_best, experiment.at_common):
+        one = set(experiment.chosen.values()) == {experiment.common}  # decoding: both tables would say the same
+        for comparison in [experiment.own_best] if one else [experiment.own_best, experiment.at_common]:
             rows = comparison_table(experiment, comparison).splitlines()
             assert not [row for row in rows if row not in told]
 
