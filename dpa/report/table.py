@@ -16,6 +16,8 @@ REFERENCE = "reference"
 MISSING = "\N{EN DASH}"
 """Stands for a number that was not measured."""
 MINUS = "\N{MINUS SIGN}"
+ROUNDING = 1e-12
+"""A difference below this is none: it is what sums of floats leave."""
 
 
 class Column(NamedTuple):
@@ -129,14 +131,13 @@ def number(value: float | None, digits: int) -> str:
 
 
 def signed(value: float, digits: int = 3) -> str:
-    """A difference with its sign; a value that rounds to zero has none.
+    """A difference with its sign, also where it rounds to zero: on which side a bound lies decides what may be said.
 
     Examples:
-        >>> signed(0.0123), signed(-0.002), signed(-0.0001)
-        ('+0.012', '−0.002', '0.000')
+        >>> signed(0.0123), signed(-0.0001), signed(-1e-16)
+        ('+0.012', '−0.000', '0.000')
     """
-    text = f"{value:+.{digits}f}"
-    return text[1:] if float(text) == 0 else text.replace("-", MINUS)
+    return f"{0:.{digits}f}" if abs(value) < ROUNDING else f"{value:+.{digits}f}".replace("-", MINUS)
 
 
 def difference(mean: float | None, interval: Sequence[float] | None) -> str:
