@@ -76,8 +76,6 @@ def read_setups(cfg: DictConfig) -> dict[str, Setup]:
                 f"methods.{name}.data.kind=expert learns from another method's rollouts; say whose: "
                 f"experiment.setup.{name}.expert=METHOD."
             )
-        if not setup.length > 0:
-            raise ValueError(f"experiment.setup.{name}.length must be positive, got {setup.length}.")
         if setup.ranking is not None and setup.ranking not in cfg.rankings:
             raise ValueError(
                 f"experiment.setup.{name}.ranking={setup.ranking!r} is not among rankings: {', '.join(cfg.rankings)}."

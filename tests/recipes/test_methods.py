@@ -83,7 +83,7 @@ def test_a_method_comes_after_those_that_it_starts_from_or_learns_from() -> None
             "experiment.setup.dpa_omf.alignment has no option 'step'",
         ),
         (("+experiment.setup.dpa_omf={alignment:{steps:5}}",), "alignment of dpa_omf:.warmup must be less than"),
-        (("+experiment.setup.dpa_omf={length:0}",), "experiment.setup.dpa_omf.length must be positive, got 0"),
+        (("+experiment.setup.dpa_omf={length:0}",), "experiment.setup.dpa_omf.length must be above 0, got 0"),
         (("+experiment.setup.dpa_omf={expert:dpa_adef}",), "is for methods.dpa_omf.data.kind=expert, which is pairs"),
         (("ranking@collection.ranking=displacement",), "couples nothing; say pictures.scenes=0"),
         (("experiment.versus=cpl",), "experiment.versus=cpl is no method of the experiment; name one of dpa_omf"),
