@@ -49,29 +49,26 @@ def plot_likely(players: Sequence[PlayerScene], path: str | Path) -> None:
     rows = -(-panels // columns)
     figure = blank_figure(PANEL * columns + 0.4, (PANEL + 0.35) * rows * len(players) + 0.8)
     grid = figure.add_gridspec(rows * len(players), columns)
-    used = [False, False]
+    found: list[list[Tensor]] = []
     for number, player in enumerate(players):
         places = [figure.add_subplot(grid[number * rows + each // columns, each % columns]) for each in range(panels)]
         for axes in places[1 + len(player.rollouts) :]:
             axes.set_axis_off()
-        marked = _draw_scene(places, player.scene, player.rollouts)
-        used = [before or now for before, now in zip(used, marked, strict=True)]
-    draw_legend(figure, [player.scene for player in players], used)
+        found += _draw_scene(places, player.scene, player.rollouts)
+    draw_legend(figure, [player.scene for player in players], found)
     save_figure(figure, path)
 
 
-def _draw_scene(places: Sequence[Axes], scene: Scene, rollouts: Mapping[str, JudgedRollouts]) -> tuple[bool, bool]:
-    """The log in the first place and a policy in each that follows; returns which marks are drawn."""
+def _draw_scene(places: Sequence[Axes], scene: Scene, rollouts: Mapping[str, JudgedRollouts]) -> list[list[Tensor]]:
+    """The log in the first place, a policy in each that follows; returns of each policy the steps that are marked."""
     driven = pose_tracks(scene)
     logged = [flags[scene.agents.present].any(-1) for flags in logged_mishaps(scene)]
     draw_panel(places[0], scene, driven, f"log of {scene.scene_id}")
     found = []
     for axes, (name, judged) in zip(places[1:], rollouts.items(), strict=False):
-        first = _draw_likeliest(axes, scene, name, judged, logged)
+        found.append(_draw_likeliest(axes, scene, name, judged, logged))
         draw_log_paths(axes, scene, driven)
-        found.append([bool((steps >= 0).any()) for steps in first])
-    collided, left = zip(*found, strict=True) if found else ([], [])
-    return any(collided), any(left)
+    return found
 
 
 def _draw_likeliest(

@@ -62,13 +62,19 @@ def draw_marks(axes: Axes, poses: Tensor, first: Sequence[Tensor]) -> None:
         axes.scatter(x, y, s=34, marker=marker, color=color, edgecolors="white", lw=0.8, zorder=15)
 
 
-def draw_legend(figure: Figure, scenes: Sequence[Scene], used: Sequence[bool]) -> None:
-    """Below the panels: classes of agents, the path in the log, and of :data:`MARKS` those that are used."""
+def draw_legend(figure: Figure, scenes: Sequence[Scene], found: Sequence[Sequence[Tensor]]) -> None:
+    """Below the panels: classes of agents, the path in the log, and of :data:`MARKS` those that are used.
+
+    Args:
+        figure: of the panels.
+        scenes: that are drawn.
+        found: of each panel, or of several together, the steps that :func:`draw_marks` took.
+    """
     agents = {handle.get_label(): handle for scene in scenes for handle in legend_handles(scene)}
     marks = [
         Line2D([], [], marker=marker, ls="", ms=7, mec="white", mfc=color, label=f"{name}, not in the log")
-        for there, (name, (marker, color)) in zip(used, MARKS.items(), strict=True)
-        if there
+        for place, (name, (marker, color)) in enumerate(MARKS.items())
+        if any(bool((first[place] >= 0).any()) for first in found)
     ]
     handles = [*agents.values(), Line2D([], [], **LOG_PATH, label="path in the log"), *marks]
     rows = -(-len(handles) * LEGEND_ENTRY // figure.get_figwidth())

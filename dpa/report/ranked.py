@@ -82,7 +82,7 @@ def plot_ranked(
         draw_panel(axes, scene, tracks, title)
         draw_log_paths(axes, scene, driven)
         draw_marks(axes, trajectories[k, agents], [first[position] for first in found])
-    draw_legend(figure, [scene], [bool((first >= 0).any()) for first in found])
+    draw_legend(figure, [scene], [found])
     text = f"scene {scene.scene_id}: of {len(distance)} rollouts, the nearest to the log above and the farthest below"
     figure.suptitle(text, fontsize=10.5, color=INK)
     save_figure(figure, path)

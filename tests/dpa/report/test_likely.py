@@ -11,7 +11,6 @@ import pytest
 from dpa.report.likely import plot_likely
 from dpa.report.panels import MARKS
 from dpa.report.player import PlayerScene
-from envs.scene import Scene
 from envs.sources.synthetic import two_cars_head_on
 from tests.dpa.report.drawings import marks
 from tests.dpa.report.made_rollouts import COLLISION, OFFROAD, judged, made_players, slower, with_mishaps
@@ -40,13 +39,9 @@ def test_the_first_collision_and_departure_of_each_agent_are_marked(drawn: list[
     assert {"collision, not in the log", "off road, not in the log"} < told
 
 
-def head_on() -> tuple[Scene, PlayerScene]:
-    scene = two_cars_head_on()
-    return scene, PlayerScene(scene, {"reference": judged(scene, [slower(scene, 0.0)], [-1.0])})
-
-
 def test_who_collides_in_the_log_as_well_is_not_marked(drawn: list[Any], tmp_path: Path) -> None:
-    _, player = head_on()
+    scene = two_cars_head_on()
+    player = PlayerScene(scene, {"reference": judged(scene, [slower(scene, 0.0)], [-1.0])})
     assert player.rollouts["reference"].collides.any()
     plot_likely([player], tmp_path / "likely.png")
     assert not any(len(marks(axes, name)) for axes in drawn[0].axes for name in MARKS)
