@@ -33,6 +33,7 @@ def plot_likely(players: Sequence[PlayerScene], path: str | Path) -> None:
         ValueError: no scenes, or the path is no PNG.
 
     Examples:
+        >>> import tempfile
         >>> import torch
         >>> from dpa.ranking import PreferenceDistance, log_trajectory
         >>> from dpa.report.judged import judge_rollouts
@@ -40,7 +41,8 @@ def plot_likely(players: Sequence[PlayerScene], path: str | Path) -> None:
         >>> scene = straight_road(2)
         >>> log, nats = log_trajectory(scene, 80)[None], torch.tensor([-1.0])
         >>> judged = judge_rollouts(scene, log, torch.ones(2, dtype=torch.bool), nats, PreferenceDistance(), kept=1)
-        >>> plot_likely([PlayerScene(scene, {"reference": judged})], "likely.png")
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     plot_likely([PlayerScene(scene, {"reference": judged})], Path(folder) / "likely.png")
     """
     if not players:
         raise ValueError("there is no scene to draw; give at least one.")
