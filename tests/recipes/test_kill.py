@@ -127,6 +127,7 @@ def test_a_collection_killed_at_fifty_random_moments(run: Callable, options: Cal
         store = PreferenceStore(folder)
         found.add(len(store))
         if len(store) == 6:
+            assert not collecting(folder), "the same command once more, to its end"
             assert_same_preferences(folder, tmp_path / "whole")
             folder = tmp_path / str(kills)
     assert len(found) > 2, "kills came at different moments"
