@@ -81,6 +81,7 @@ class Line(NamedTuple):
         markers: sizes, one for each point or for all; 0 for none.
         band: lower and upper values, as many as ``x``.
         error: differences from ``y`` up and down, as many as ``x``.
+        text: written beside each point.
         legend: it stands in the legend.
         opacity: of the line.
     """
@@ -95,6 +96,7 @@ class Line(NamedTuple):
     markers: float | Sequence[float] = 0
     band: tuple[Sequence[float], Sequence[float]] | None = None
     error: tuple[Sequence[float], Sequence[float]] | None = None
+    text: Sequence[str] | None = None
     legend: bool = True
     opacity: float = 1.0
 
@@ -237,7 +239,8 @@ def curves(
 
 
 def _trace(line: Line) -> dict[str, Any]:
-    shown = [mode for mode, there in (("lines", line.width), ("markers", line.markers)) if there]
+    drawn = (("lines", line.width), ("markers", line.markers), ("text", line.text))
+    shown = [mode for mode, there in drawn if there]
     trace: dict[str, Any] = {
         "x": list(line.x), "y": list(line.y), "name": escape(line.name, quote=False), "mode": "+".join(shown),
         "legendgroup": line.name, "showlegend": line.legend, "opacity": line.opacity,
@@ -246,6 +249,9 @@ def _trace(line: Line) -> dict[str, Any]:
     if line.markers:
         sizes = line.markers if isinstance(line.markers, (int, float)) else list(line.markers)
         trace["marker"] = {"size": sizes, "color": line.colour, "opacity": 1, "line": {"color": "white", "width": 1}}
+    if line.text is not None:
+        texts = [escape(text, quote=False) for text in line.text]
+        trace |= {"text": texts, "textposition": "top right", "textfont": {"color": line.colour}}
     if line.error is not None:
         up, down = map(list, line.error)
         trace["error_y"] = {

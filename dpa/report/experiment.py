@@ -24,6 +24,8 @@ LIKELIHOOD = {"method": str, "seed": int, "file": str}
 BUDGET = {"steps": int, "rollouts": int, "start": str}
 SPLITS = {"train": "training", "tune": "tuning", "eval": "evaluation"}
 """What the scenes of a split are called."""
+SAMPLED = {"own best": "each at its own best decoding", "common": "all at the common decoding"}
+"""In what decodings an experiment compares its methods."""
 REPORTED = ("eval", "tune")
 """Splits that an experiment may report."""
 
@@ -154,6 +156,19 @@ class Experiment:
     def reported(self) -> str:
         """The scenes that the numbers are of, such as ``54 evaluation scenes``."""
         return f"{self.scenes[self.split]} {SPLITS[self.split]} scenes"
+
+    def comparisons(self) -> dict[str, Comparison]:
+        """What to show, by how methods were sampled; one comparison where all had one decoding: both are that one."""
+        rows = (*self.at_common.rows, *self.own_best.rows)
+        if len({decoding_of(row) for row in rows}) == 1:
+            return {in_words(self.common): self.own_best}
+        return {"own best": self.own_best, "common": self.at_common}
+
+    @property
+    def sampled(self) -> str:
+        """In words, how methods were sampled in the comparison that tells the result."""
+        kind = next(iter(self.comparisons()))
+        return SAMPLED.get(kind, f"sampled alike at {kind}")
 
     def grid(self) -> list[Decoding]:
         """Every decoding that was tried on the tuning scenes."""

@@ -17,28 +17,29 @@ def headline(experiment: Experiment) -> str:
     """The result in one sentence that claims no more than the interval does.
 
     It is about the method that ``experiment.headline`` names, at its own best decoding against the reference at its
-    own: a gain that sharper sampling of the reference reaches too is none.
+    own, where several were tried: a gain that sharper sampling of the reference reaches too is none.
     """
     entry = experiment.own_best.entry(experiment.headline)
     if entry is None:
         return "No claim: no method was compared with the reference."
     low, high = entry["ci95"]
     name, where = experiment.labels[experiment.headline], f"on {experiment.reported}"
+    sampled = experiment.sampled
     interval = f"95 % interval [{signed(low)}, {signed(high)}]"
     if entry["over"] == SCENES:
         change = signed(entry["realism_difference"])
         return (
-            f"No claim about a method from one training run: each at its own best decoding, this {name} differs from "
+            f"No claim about a method from one training run: {sampled}, this {name} differs from "
             f"its reference by {change} realism {where} ({interval} over scenes alone)."
         )
     if low <= 0 <= high:
         change = signed(entry["realism_difference"])
         return (
-            f"No claim: each at its own best decoding, {name} differs from the reference by {change} realism {where}, "
+            f"No claim: {sampled}, {name} differs from the reference by {change} realism {where}, "
             f"and the {interval} contains 0."
         )
     size, word = f"{abs(entry['realism_difference']):.3f}", "more" if low > 0 else "less"
-    return f"Each at its own best decoding, {name} is {size} {word} realistic than the reference {where} ({interval})."
+    return f"{sampled.capitalize()}, {name} is {size} {word} realistic than the reference {where} ({interval})."
 
 
 def reservations(experiment: Experiment, num_compared: int | None = None) -> list[str]:
@@ -75,8 +76,7 @@ def reservations(experiment: Experiment, num_compared: int | None = None) -> lis
 
 def differences_of(experiment: Experiment) -> int:
     """How many differences of realism an experiment has."""
-    own = experiment.own_best
-    return len(own.paired) + len(own.versus) + len(experiment.at_common.paired)
+    return sum(len(each.paired) + len(each.versus) for each in experiment.comparisons().values())
 
 
 def chosen_on_the_same(experiment: Experiment) -> str | None:

@@ -89,12 +89,14 @@ def facts(named: Mapping[str, object]) -> Html:
 
 
 def tabs(panels: Mapping[str, Html], name: str) -> Html:
-    """Panels of which one is shown; without a script all are, one below the other.
+    """Panels of which one is shown; without a script all are, one below the other. A single one needs no tabs.
 
     Args:
         panels: by title.
         name: unique in the page.
     """
+    if len(panels) == 1:
+        return next(iter(panels.values()))
     buttons = [
         element(
             "button", title, type="button", role="tab", id=f"{name}-tab-{place}", aria_controls=f"{name}-{place}",

@@ -32,7 +32,11 @@ def _experiment(experiment: Experiment) -> Iterator[str]:
     yield f"    {experiment.command}"
     yield _made(experiment)
     yield headline(experiment)
-    yield f"**Each at its own best decoding**, chosen on the {experiment.scenes['tune']} tuning scenes:"
+    compared = experiment.comparisons()
+    if "own best" in compared:
+        yield f"**Each at its own best decoding**, chosen on the {experiment.scenes['tune']} tuning scenes:"
+    else:
+        yield f"**All at {next(iter(compared))}**, the one decoding of this experiment:"
     yield comparison_table(experiment, experiment.own_best)
     if told := ordering(experiment):
         yield f"Against {experiment.labels[experiment.versus]}, {told}."
@@ -40,8 +44,9 @@ def _experiment(experiment: Experiment) -> Iterator[str]:
         told for told in (budgets(experiment), chosen_on_the_same(experiment), left_out(experiment)) if told
     ]:
         yield " ".join(remarks)
-    yield "**All at the common decoding**, and the reference at the others:"
-    yield comparison_table(experiment, experiment.at_common)
+    if "common" in compared:
+        yield "**All at the common decoding**, and the reference at the others:"
+        yield comparison_table(experiment, experiment.at_common)
     if experiment.likelihood:
         yield "**Likelihood** of the reference's ranked rollouts, per token [nats]; KL along rollouts of the method:"
         yield likelihood_table(experiment)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from dpa.report.experiment import Experiment, decoding_against, decoding_of, in_words
+from dpa.report.experiment import SAMPLED, Experiment, decoding_against, decoding_of, in_words
 from dpa.report.findings import differences_of, headline, reservations
 from dpa.report.markup import Html, element, hint, joined
 from dpa.report.study import Study
@@ -24,8 +24,8 @@ def claim(study: Study) -> Html:
     compared = sum(differences_of(each) for each in study.experiments.values())
     notes = [element("li", note) for note in reservations(experiment, compared)]
     cards = [
-        _card(experiment, "each at its own best decoding", experiment.own_best.entry(experiment.headline)),
-        _card(experiment, "both at the common decoding", experiment.at_common.entry(experiment.headline)),
+        _card(experiment, SAMPLED.get(kind, experiment.sampled), each.entry(experiment.headline))
+        for kind, each in experiment.comparisons().items()
     ]
     return joined(
         [

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from dpa.report.charts import Chart, Difference, Line, curves, forest, gallery, lines
-from dpa.report.experiment import Comparison, Experiment, decoding_against, decoding_of, in_words
+from dpa.report.experiment import SAMPLED, Comparison, Experiment, decoding_against, decoding_of, in_words
 from dpa.report.findings import budgets, chosen_on_the_same, left_out, ordering
 from dpa.report.markup import (
     Html,
@@ -33,7 +33,6 @@ from dpa.report.table import COLUMNS, MISSING, REFERENCE, duration, number, sign
 
 MAIN = ("kinematic", "interactive", "map_based", "realism", "min_ade")
 """Figures of the first table, in the paper's order."""
-OWN_BEST, COMMON = "each at its own best decoding", "all at the common decoding"
 
 
 def experiment_section(experiment: Experiment, colours: Mapping[str, str], evaluations: Evaluations) -> Section:
@@ -44,10 +43,8 @@ def experiment_section(experiment: Experiment, colours: Mapping[str, str], evalu
         colours: of its methods.
         evaluations: figures of every scene behind its rows.
     """
-    panels = {
-        OWN_BEST: _panel(experiment, experiment.own_best, evaluations),
-        COMMON: _panel(experiment, experiment.at_common, evaluations),
-    }
+    compared = experiment.comparisons()
+    panels = {SAMPLED.get(kind, kind): _panel(experiment, each, evaluations) for kind, each in compared.items()}
     charts = [
         differences(experiment),
         versus(experiment),
@@ -58,6 +55,7 @@ def experiment_section(experiment: Experiment, colours: Mapping[str, str], evalu
         _scenes(experiment),
         f"numbers are of the {experiment.reported}",
         f"seeds {', '.join(map(str, experiment.seeds))}",
+        *(f"one decoding, {kind}" for kind in compared.keys() - SAMPLED.keys()),
         f"realism metric of {experiment.metric}",
         *([f"in the paper: {experiment.paper}"] if experiment.paper else []),
     ]
@@ -75,33 +73,33 @@ def experiment_section(experiment: Experiment, colours: Mapping[str, str], evalu
 
 
 def differences(experiment: Experiment) -> Chart | None:
-    """Forest of paired differences at both decodings; None where nothing was compared."""
-    own, common = experiment.own_best, experiment.at_common
-    groups = {
-        "own best": _differences(experiment, own, own.paired),
-        "common": _differences(experiment, common, common.paired),
-    }
+    """Forest of paired differences at every decoding; None where nothing was compared."""
+    compared = experiment.comparisons()
+    groups = {kind: _differences(experiment, each, each.paired) for kind, each in compared.items()}
     groups = {kind: found for kind, found in groups.items() if found}
     if not groups:
         return None
-    caption = (
-        f"Paired scene by scene on {experiment.reported}; blue is better, orange worse, grey not told apart. Full: own "
-        "best decodings. Hollow: the common decoding, where the reference at other decodings shows what sampling alone "
-        "does."
-    )
+    caption = f"Paired scene by scene on {experiment.reported}; blue is better, orange worse, grey not told apart."
+    if compared.keys() == SAMPLED.keys():
+        caption += (
+            " Full: own best decodings. Hollow: the common decoding, where the reference at other decodings shows what "
+            "sampling alone does."
+        )
     title = "Realism minus that of the reference, 95 % intervals"
     return forest(groups, title, x="difference in realism", caption=caption)
 
 
 def versus(experiment: Experiment) -> Chart | None:
     """Forest of the other methods against ``experiment.versus``; None where there is no other."""
-    found = _differences(experiment, experiment.own_best, experiment.own_best.versus)
+    kind, own = next(iter(experiment.comparisons().items()))
+    found = _differences(experiment, own, own.versus)
     if not found:
         return None
     standard = experiment.labels[experiment.versus]
-    caption = f"Each at its own best decoding, on {experiment.reported}. Against {standard}, {ordering(experiment)}."
+    how = f"{experiment.sampled}, on {experiment.reported}"
+    caption = f"{how.capitalize()}. Against {standard}, {ordering(experiment)}."
     title = f"Realism minus that of {standard}, 95 % intervals"
-    return forest({"own best": found}, title, x=f"difference in realism to {standard}", caption=caption)
+    return forest({kind: found}, title, x=f"difference in realism to {standard}", caption=caption)
 
 
 def matched_curves(experiment: Experiment, colours: Mapping[str, str]) -> list[Chart]:

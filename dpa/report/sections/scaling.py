@@ -9,6 +9,9 @@ from dpa.report.charts import Chart, Line, curves, lines
 from dpa.report.experiment import Comparison, Experiment
 from dpa.report.table import REFERENCE, difference, number
 
+COLOURS, DASHES = ("#2a78b5", "#c79a1b"), ("solid", "dot")
+"""Of what is scaled, for the comparisons of an experiment."""
+
 
 def scaling_charts(experiment: Experiment, colours: Mapping[str, str]) -> list[Chart]:
     """The figures of an experiment that scales something, or that evaluated snapshots; others have none.
@@ -25,35 +28,27 @@ def _against_axis(experiment: Experiment) -> list[Chart]:
     if axis is None:
         return []
     content = []
-    kinds = (
-        ("own best decoding", experiment.own_best, "#2a78b5"),
-        ("common decoding", experiment.at_common, "#c79a1b"),
-    )
-    for kind, comparison, colour in kinds:
-        entries = sorted(
-            (entry for entry in comparison.paired if entry["method"] in axis.values),
-            key=lambda entry: axis.values[entry["method"]],
-        )
+    for (kind, comparison), colour, dash in zip(experiment.comparisons().items(), COLOURS, DASHES, strict=False):
+        entries = _scaled(experiment, comparison)
         if not entries:
             continue
-        means = [entry["realism_difference"] for entry in entries]
         content.append(
             Line(
                 kind,
                 [axis.values[entry["method"]] for entry in entries],
-                means,
+                [entry["realism_difference"] for entry in entries],
                 colour,
                 hover=[
-                    lines(f"{experiment.labels[entry['method']]}, {kind}", *_told(entry), f"{axis.name}: {x:g}")
+                    lines(
+                        f"{experiment.labels[entry['method']]}, {kind}",
+                        *_told(entry),
+                        f"{axis.name}: {axis.values[entry['method']]:g}",
+                    )
                     for entry in entries
-                    for x in (axis.values[entry["method"]],)
                 ],
-                dash="solid" if comparison is experiment.own_best else "dot",
+                dash=dash,
                 markers=8,
-                error=(
-                    [entry["ci95"][1] - mean for entry, mean in zip(entries, means, strict=True)],
-                    [mean - entry["ci95"][0] for entry, mean in zip(entries, means, strict=True)],
-                ),
+                error=_errors(entries),
             )
         )
     title = f"Realism against {axis.name}"
@@ -63,44 +58,67 @@ def _against_axis(experiment: Experiment) -> list[Chart]:
 
 
 def _against_kl(experiment: Experiment, colours: Mapping[str, str]) -> list[Chart]:
-    """One line for each method with snapshots, from the reference on; solid at own best decodings."""
-    bases = list(dict.fromkeys(method.partition("@")[0] for method in experiment.methods if "@" in method))
+    """What was scaled, in its order, and one line for each method with snapshots, from the reference on."""
     kl = {method: _mean_kl(experiment, method) for method in experiment.methods}
+    bases = list(dict.fromkeys(method.partition("@")[0] for method in experiment.methods if "@" in method))
     content = []
-    for comparison, kind in ((experiment.own_best, "own best"), (experiment.at_common, "common")):
+    for (kind, comparison), colour, dash in zip(experiment.comparisons().items(), COLOURS, DASHES, strict=False):
+        scaled = [entry for entry in _scaled(experiment, comparison) if kl[entry["method"]] is not None]
+        if experiment.axis is not None and scaled:
+            name, values = f"{experiment.axis.name}, {kind}", experiment.axis.values
+            line = _drift(experiment, scaled, kl, name, colour, dash)
+            told = [f"{values[entry['method']]:g}" for entry in scaled]
+            content.append(line._replace(error=_errors(scaled), text=told))
         for base in bases:
-            found = _snapshots(experiment, comparison, base, kl)
-            if not found:
-                continue
-            own = comparison is experiment.own_best
-            content.append(
-                Line(
-                    f"{experiment.labels[base]}, {kind}",
-                    [0.0, *(kl[entry["method"]] for entry in found)],
-                    [0.0, *(entry["realism_difference"] for entry in found)],
-                    colours[base],
-                    hover=[
-                        lines("reference"),
-                        *(
-                            lines(
-                                f"{experiment.labels[entry['method']]}, {kind} decoding",
-                                *_told(entry),
-                                f"KL {number(kl[entry['method']], 3)}",
-                            )
-                            for entry in found
-                        ),
-                    ],
-                    dash="solid" if own else "dot",
-                    markers=7 if own else 5,
-                )
-            )
-    caption = (
-        "Snapshots along each alignment, from the reference at the origin (figure 7 right). A line that bends down is "
-        f"over-optimisation. Both on {experiment.reported}."
+            if found := _snapshots(experiment, comparison, base, kl):
+                name = f"{experiment.labels[base]}, {kind}"
+                content.append(_from_reference(_drift(experiment, found, kl, name, colours[base], dash)))
+    caption = "".join(
+        (
+            f"Numbers at points: {experiment.axis.name}. " if experiment.axis is not None else "",
+            "Snapshots along each alignment, from the reference at the origin. " if bases else "",
+            f"A line that bends down is over-optimisation. Both on {experiment.reported} (figure 7 right).",
+        )
     )
     title = "Realism against the distance from the reference"
     shown = {"x": "KL to the reference", "y": "difference in realism", "caption": caption, "zero": True}
     return [curves(content, title, **shown)] if content else []
+
+
+def _drift(
+    experiment: Experiment, entries: Sequence[Mapping[str, Any]], kl: Mapping[str, float | None], name: str,
+    colour: str, dash: str,
+) -> Line:  # fmt: skip
+    """Differences of realism over the KL of their methods."""
+    hover = [
+        lines(experiment.labels[entry["method"]], *_told(entry), f"KL {number(kl[entry['method']], 4)}")
+        for entry in entries
+    ]
+    at = [kl[entry["method"]] for entry in entries]
+    gains = [entry["realism_difference"] for entry in entries]
+    return Line(name, at, gains, colour, hover, dash=dash, markers=7)
+
+
+def _from_reference(line: Line) -> Line:
+    """Begin where nothing has moved yet."""
+    return line._replace(x=[0.0, *line.x], y=[0.0, *line.y], hover=[lines("reference"), *(line.hover or ())])
+
+
+def _scaled(experiment: Experiment, comparison: Comparison) -> list[Mapping[str, Any]]:
+    """Differences of the methods on the axis, in its order."""
+    values = {} if experiment.axis is None else experiment.axis.values
+    return sorted(
+        (entry for entry in comparison.paired if entry["method"] in values),
+        key=lambda entry: values[entry["method"]],
+    )
+
+
+def _errors(entries: Sequence[Mapping[str, Any]]) -> tuple[list[float], list[float]]:
+    """How far intervals reach up and down."""
+    return (
+        [entry["ci95"][1] - entry["realism_difference"] for entry in entries],
+        [entry["realism_difference"] - entry["ci95"][0] for entry in entries],
+    )
 
 
 def _snapshots(

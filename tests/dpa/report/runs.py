@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,7 @@ FIGURES = (
 )  # fmt: skip
 PUBLISHED = {"dpa_omf": {"kinematic": 0.415, "realism": 0.739, "min_ade": 1.413, "pair_accuracy": 0.84}}
 
+AXIS = {"name": "rankings per scene", "values": {"r1": 1.0, "r4": 4.0, "r16": 16.0}, "log": True}
 STAGES = {
     "pretrain": {f"pretrain {seed}": 1800.0 for seed in range(3)},
     "align": {f"align {job}": 200.0 for job in range(9)},
@@ -55,8 +57,7 @@ STAGES = {
 def write_runs(folder: Path) -> Path:
     """Write the whole study: three experiments, stages, stores, curves, studies of rankings and a scene to play."""
     write_experiment(folder, "methods", ["reference", "dpa_omf", "dpa_adef", "adversarial_afd"], published=PUBLISHED)
-    axis = {"name": "rankings per scene", "values": {"r1": 1.0, "r4": 4.0, "r16": 16.0}, "log": True}
-    write_experiment(folder, "scaling", ["reference", "r1", "r4", "r16"], headline="r16", axis=axis)
+    write_experiment(folder, "scaling", ["reference", "r1", "r4", "r16"], headline="r16", axis=AXIS)
     snapshots = ["reference", "dpa_omf@20", "dpa_omf@40", "dpa_omf"]
     write_experiment(folder, "steps", snapshots)
     write(folder / "stages.json", STAGES)
@@ -72,12 +73,13 @@ def write_runs(folder: Path) -> Path:
 
 def write_experiment(
     folder: Path, name: str, methods: list[str], *, headline: str = "dpa_omf", axis: dict[str, Any] | None = None,
-    published: dict[str, Any] | None = None, split: str = "eval",
+    published: dict[str, Any] | None = None, split: str = "eval", grid: Sequence[tuple[float, float]] = GRID,
 ) -> dict[str, Any]:  # fmt: skip
     """Write one experiment with the files behind its rows; returns its content."""
-    chosen = dict.fromkeys(methods, BEST)
+    best = BEST if BEST in grid else COMMON
+    chosen = dict.fromkeys(methods, best)
     others = [method for method in methods if method != "reference"]
-    sharper = [("reference", decoding) for decoding in GRID if decoding != COMMON]
+    sharper = [("reference", decoding) for decoding in grid if decoding != COMMON]
     scenes = {"train": 8, "tune": 4, "eval": SCENES, "source": "made & up <by hand>"}
     content = {
         "name": name, "title": f"Made-up {name}", "paper": "table 1" if published else None,
@@ -90,11 +92,11 @@ def write_experiment(
         "rows": [row(folder, m, s, d, split) for m, d in [*((m, COMMON) for m in methods), *sharper] for s in SEEDS],
         "paired": [paired(m, d, COMMON) for m, d in [*((m, COMMON) for m in others), *sharper]],
         "own_best": {
-            "rows": [row(folder, method, seed, BEST, split) for method in methods for seed in SEEDS],
-            "paired": [paired(method, BEST, BEST) for method in others],
-            "versus": [paired(method, BEST, BEST, headline) for method in others if method != headline],
+            "rows": [row(folder, method, seed, best, split) for method in methods for seed in SEEDS],
+            "paired": [paired(method, best, best) for method in others],
+            "versus": [paired(method, best, best, headline) for method in others if method != headline],
         },
-        "tuning": [row(folder, m, s, d, split="tune") for m in methods for d in GRID for s in SEEDS],
+        "tuning": [row(folder, m, s, d, split="tune") for m in methods for d in grid for s in SEEDS],
         "likelihood": [likelihood(folder, method, seed, split) for method in methods for seed in SEEDS],
         "axis": axis,
         "curves": {m: {str(seed): curves(folder, m, seed) for seed in SEEDS} for m in others if "@" not in m},

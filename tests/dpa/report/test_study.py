@@ -21,7 +21,7 @@ from dpa.report.table import difference, number, signed
 from recipes import report as recipe
 from recipes.report import report
 from tests.dpa.report.parsed import Page
-from tests.dpa.report.runs import BEST, COMMON, SEEDS, label, values, write_experiment
+from tests.dpa.report.runs import AXIS, BEST, COMMON, SEEDS, label, values, write_experiment
 
 
 @pytest.fixture(scope="module")
@@ -261,19 +261,46 @@ def test_likelihood_along_training_has_a_line_for_each_seed_and_their_mean(page:
 def test_scaling_stands_over_its_axis_with_intervals(page: Page, runs: Path) -> None:
     (figure,) = figures(page, "rankings per scene")
     paired = read(runs, "experiments/scaling.json")["own_best"]["paired"]
-    line = trace(figure, "own best decoding")
+    line = trace(figure, "own best")
     assert (line["x"], figure["layout"]["xaxis"]["type"]) == ([1, 4, 16], "log")
     assert line["y"] == [_rounded(entry["realism_difference"]) for entry in paired]
     assert line["error_y"]["array"] == [_rounded(e["ci95"][1] - e["realism_difference"]) for e in paired]
 
 
 def test_snapshots_stand_over_their_distance_from_the_reference_in_order_of_steps(page: Page, runs: Path) -> None:
-    (figure,) = figures(page, "KL to the reference")
+    figure = next(each for each in figures(page, "KL to the reference") if "DPA-OMF" in each["data"][0]["name"])
     line = trace(figure, "DPA-OMF, own best")
     assert line["x"] == pytest.approx([0, 0.1, 0.2, 0.3])
     paired = {entry["method"]: entry for entry in read(runs, "experiments/steps.json")["own_best"]["paired"]}
     gains = [paired[name]["realism_difference"] for name in ("dpa_omf@20", "dpa_omf@40", "dpa_omf")]
     assert line["y"] == pytest.approx([0, *gains], rel=1e-4)
+
+
+def test_what_is_scaled_stands_over_the_distance_from_the_reference_too(page: Page, runs: Path) -> None:
+    figure = next(each for each in figures(page, "KL to the reference") if "rankings" in each["data"][0]["name"])
+    line = trace(figure, "rankings per scene, own best")
+    found = read(runs, "experiments/scaling.json")
+    kl = [np.mean([row["kl"] for row in found["likelihood"] if row["method"] == name]) for name in ("r1", "r4", "r16")]
+    assert line["x"] == pytest.approx(kl, rel=1e-4) and line["text"] == ["1", "4", "16"]
+    assert line["y"] == [_rounded(entry["realism_difference"]) for entry in found["own_best"]["paired"]]
+    assert line["error_y"]["array"] == [
+        _rounded(e["ci95"][1] - e["realism_difference"]) for e in found["own_best"]["paired"]
+    ]
+
+
+def test_what_was_sampled_in_one_way_alone_is_shown_once(copied: Path, tmp_path: Path) -> None:
+    for path in copied.glob("experiments/*.json"):
+        if path.stem != "scaling":
+            path.unlink()
+    write_experiment(copied, "scaling", ["reference", "r1", "r4", "r16"], headline="r16", axis=AXIS, grid=(COMMON,))
+    page = Page(report(copied, tmp_path / "out").read_text(encoding="utf-8"))
+    assert len(table(page, "method", "kinematic ↑")) == 4 and "one decoding, top-p 0.95" in page.text
+    assert "best decoding" not in page.text and "common decoding" not in page.text
+    assert page.text.count("Sampled alike at top-p 0.95") == 2, "the headline, and the other methods to it"
+    for axis in ("difference in realism", "difference in realism to 16 rankings", "rankings per scene"):
+        (figure,) = figures(page, axis)
+        assert {each["name"] for each in figure["data"] if each.get("name")} == {"top-p 0.95"}
+    assert "5 differences of realism" in page.text, "three to the reference, two to the headline"
 
 
 def test_the_validity_of_a_distance_is_a_figure_and_a_table(page: Page, runs: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from dpa.report.experiment import read_experiment
 from dpa.report.table import difference, number
 from recipes.report import report
-from tests.dpa.report.runs import write_runs
+from tests.dpa.report.runs import COMMON, write_experiment, write_runs
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +64,14 @@ def test_values_and_differences_are_those_of_the_files(runs: Path, text: str) ->
     assert own["DPA-OMF"]["steps"] == ["60"] and own["reference"]["steps"] == ["–"]
     paper = own["*paper: DPA-OMF*"]
     assert (paper["realism ↑"], paper["interactive ↑"], paper["steps"]) == (["0.739"], ["–"], ["–"])
+
+
+def test_what_was_sampled_in_one_way_alone_has_one_table(tmp_path: Path) -> None:
+    write_experiment(tmp_path, "methods", ["reference", "dpa_omf", "dpa_adef"], grid=(COMMON,))
+    told = report(tmp_path, tmp_path / "tables.md").read_text(encoding="utf-8")
+    assert told.count("| method | steps |") == 1 and "**Each" not in told and "common decoding" not in told
+    rows = rows_of(told, "**All at top-p 0.95**, the one decoding")
+    assert list(rows) == ["reference", "DPA-OMF", "DPA-ADEF"] and "Δ to DPA-OMF" in rows["DPA-ADEF"]
 
 
 def test_likelihoods_are_means_over_seeds(runs: Path, text: str) -> None:
