@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
@@ -23,7 +24,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from dpa.training.distributed import started_ranks
 from envs.allocator import keep_freed_memory
 from envs.options import differences
-from recipes.common.limits import check_limits
+from recipes.common.limits import check_added, check_limits
 
 CONFIG = {"version_base": "1.3", "config_path": str(Path(__file__).parents[1] / "config")}
 """Arguments of ``hydra.main`` that all recipes share; with an absolute path, ``main`` may also be imported."""
@@ -57,6 +58,7 @@ def ranked_recipe(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], 
     def run(cfg: DictConfig) -> None:
         warnings.filterwarnings("ignore", category=DeprecationWarning, module="torchrl")
         try:
+            check_added(HydraConfig.get().overrides.task if HydraConfig.initialized() else (), cfg)
             check_limits(cfg)
             check_resources(cfg)
             main(cfg)

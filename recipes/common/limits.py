@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
@@ -63,6 +64,12 @@ LIMITS: dict[str, Limit] = {
     "snapshots": COUNT._replace(many=True),
 }
 """Limit of an option by its last name, or by its last two where one name has several meanings."""
+CLOSED = (
+    *("", "pretraining", "collection", "alignment", "evaluation", "decoding", "pictures", "experiment", "logger"),
+    *("training", "method", "model"),
+)
+"""Sections whose options all stand in their YAML; ``""`` is the recipe itself."""
+GROUPS = Path(__file__).parents[1] / "config"
 WORDS = {
     int: "a whole number",
     float: "a number",
@@ -110,11 +117,40 @@ def check_limits(cfg: DictConfig) -> None:
                 raise ValueError(f"{name} must be {wanted}, got {each!r}.")
 
 
+def check_added(overrides: Iterable[str], cfg: DictConfig) -> None:
+    """Refuse options that a command adds (``+alignment.step=9``) to a section where nobody would read them.
+
+    Sections that hold what a user names (methods, rankings, setups), or whose reader knows what it takes, are left out.
+
+    Args:
+        overrides: of the command line.
+        cfg: that they have made.
+
+    Raises:
+        ValueError: naming the section and what it has.
+
+    Examples:
+        >>> check_added(["+alignment.step=9"], OmegaConf.create({"alignment": {"steps": 150, "lr": 3e-5, "step": 9}}))
+        Traceback (most recent call last):
+        ...
+        ValueError: alignment has no option 'step'; it takes steps, lr.
+    """
+    added = {override.lstrip("+").partition("=")[0] for override in overrides if override.startswith("+")}
+    for key in sorted(added):
+        section, _, option = key.rpartition(".")
+        if section not in CLOSED or (not section and (GROUPS / option.partition("@")[0]).is_dir()):
+            continue
+        known = (str(name) for name in (OmegaConf.select(cfg, section) if section else cfg))
+        taken = [name for name in known if f"{section}.{name}".lstrip(".") not in added]
+        where = section or "the recipe"
+        raise ValueError(f"{where} has no option {option!r}; it takes {', '.join(taken)}.")
+
+
 def _leaves(section: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     for key, value in section.items():
         if not isinstance(value, dict):
             yield f"{prefix}{key}", value
-        elif key != "labels":  # named after methods, not options
+        elif key not in ("labels", "values"):  # their entries are named after methods, not options
             yield from _leaves(value, f"{prefix}{key}.")
 
 
