@@ -12,10 +12,22 @@ from hypothesis import strategies as st
 from dpa.report.statistics import SCENES, SEEDS_AND_SCENES, compare_methods, paired_bootstrap, summary
 
 
-def simulated(rng: np.random.Generator, num_seeds: int, seed_sd: float, gain: float = 0.01) -> np.ndarray:
+def simulated(
+    rng: np.random.Generator, num_seeds: int, seed_sd: float, gain: float = 0.01, num_scenes: int = 54
+) -> np.ndarray:
     """``[seeds, scenes]`` differences with an effect of the scene (shared by seeds), of the run, and noise."""
-    scene, run = rng.normal(0, 0.03, (1, 54)), rng.normal(0, seed_sd, (num_seeds, 1))
-    return gain + scene + run + rng.normal(0, 0.03, (num_seeds, 54))
+    scene, run = rng.normal(0, 0.03, (1, num_scenes)), rng.normal(0, seed_sd, (num_seeds, 1))
+    return gain + scene + run + rng.normal(0, 0.03, (num_seeds, num_scenes))
+
+
+def coverage(num_seeds: int, seed_sd: float, trials: int, num_scenes: int = 54, num_resamples: int = 500) -> float:
+    """Share of simulated experiments whose interval holds the true gain."""
+    rng, held = np.random.default_rng(5), 0
+    for trial in range(trials):
+        values = simulated(rng, num_seeds, seed_sd, num_scenes=num_scenes)
+        found = paired_bootstrap(values, np.zeros((1, num_scenes)), num_resamples, seed=trial)
+        held += found.low <= 0.01 <= found.high
+    return held / trials
 
 
 def test_identical_methods_differ_by_exactly_nothing() -> None:
@@ -60,22 +72,21 @@ def test_seeds_that_disagree_widen_the_interval() -> None:
 
 @pytest.mark.parametrize(("seeds", "seed_sd", "least"), [(1, 0.0, 0.88), (3, 0.01, 0.85), (5, 0.01, 0.88)])
 def test_the_interval_holds_the_true_gain_about_as_often_as_it_says(seeds: int, seed_sd: float, least: float) -> None:
-    rng, trials, held = np.random.default_rng(5), 200, 0
-    for trial in range(trials):
-        values = simulated(rng, seeds, seed_sd)
-        found = paired_bootstrap(values, np.zeros((1, 54)), num_resamples=500, seed=trial)
-        held += found.low <= 0.01 <= found.high
-    assert least <= held / trials
+    assert least <= coverage(seeds, seed_sd, trials=200)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("seeds", "scenes", "told"), [(1, 54, 0.67), (2, 54, 0.86), (3, 54, 0.91), (5, 54, 0.93), (3, 400, 0.80), (5, 400, 0.88)]
+)  # fmt: skip
+def test_how_often_few_runs_hold_the_true_gain_is_as_documented(seeds: int, scenes: int, told: float) -> None:
+    assert f"{told:.0%}".replace("%", " %") in " ".join(str(paired_bootstrap.__doc__).split())
+    assert coverage(seeds, 0.01, trials=2000, num_scenes=scenes) == pytest.approx(told, abs=0.01)
 
 
 def test_one_seed_knows_nothing_of_the_spread_between_runs() -> None:
-    rng = np.random.default_rng(6)
-    held = 0
-    for _ in range(200):
-        found = paired_bootstrap(simulated(rng, 1, 0.01), np.zeros((1, 54)), num_resamples=500)
-        held += found.low <= 0.01 <= found.high
-    assert held / 200 < 0.8
-    assert found.over == SCENES
+    assert coverage(1, 0.01, trials=200) < 0.8
+    assert summary([[0.1, 0.2]]).over == SCENES
 
 
 def test_draws_are_reproducible_and_one_reference_serves_all_seeds() -> None:
