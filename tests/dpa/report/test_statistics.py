@@ -77,8 +77,9 @@ def test_the_interval_holds_the_true_gain_about_as_often_as_it_says(seeds: int, 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("seeds", "scenes", "told"), [(1, 54, 0.67), (2, 54, 0.86), (3, 54, 0.91), (5, 54, 0.93), (3, 400, 0.80), (5, 400, 0.88)]
-)  # fmt: skip
+    ("seeds", "scenes", "told"),
+    [(1, 54, 0.67), (2, 54, 0.86), (3, 54, 0.91), (5, 54, 0.93), (3, 400, 0.80), (5, 400, 0.88)],
+)
 def test_how_often_few_runs_hold_the_true_gain_is_as_documented(seeds: int, scenes: int, told: float) -> None:
     assert f"{told:.0%}".replace("%", " %") in " ".join(str(paired_bootstrap.__doc__).split())
     assert coverage(seeds, 0.01, trials=2000, num_scenes=scenes) == pytest.approx(told, abs=0.01)
