@@ -148,9 +148,11 @@ def _decoding(experiment: Experiment, entry: Mapping[str, Any]) -> list[str]:
             f"Sampling alone moves the reference by {signed(best['realism_difference'])} at best "
             f"(at {in_words(decoding_of(best))} instead of {in_words(experiment.common)})."
         )
+    if len({temperature for _, temperature in grid}) == 1:
+        notes.append(f"Of decodings only top-p was varied, at temperature {experiment.common[1]:g}.")
     edges = [
         f"{experiment.labels[method]} ({in_words(experiment.chosen[method])})"
-        for method in dict.fromkeys((REFERENCE, experiment.versus, experiment.headline))
+        for method in experiment.methods
         if method in experiment.chosen and _at_edge(experiment.chosen[method], grid)
     ]
     if edges:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
-from dpa.report.experiment import Comparison, Experiment
+from dpa.report.experiment import Comparison, Experiment, decoding_of
 from dpa.report.findings import budgets, chosen_on_the_same, headline, left_out, ordering
+from dpa.report.paired import paired_figure
 from dpa.report.sections.likelihood import DIGITS, FIGURES
-from dpa.report.study import Study
+from dpa.report.sections.safety import groups_of, measured
+from dpa.report.study import Evaluations, Study
 from dpa.report.table import COLUMNS, MISSING, cells, difference, duration, header, number, summarise, to_markdown
 
 
@@ -21,11 +23,12 @@ def study_text(study: Study) -> str:
     Returns:
         Markdown, with a heading of second level for each experiment and for the account.
     """
-    parts = [block for experiment in study.experiments.values() for block in _experiment(experiment)]
+    evaluations = Evaluations(study.folder)
+    parts = [block for experiment in study.experiments.values() for block in _experiment(experiment, evaluations)]
     return "\n\n".join([*parts, *_account(study.stages)]) + "\n"
 
 
-def _experiment(experiment: Experiment) -> Iterator[str]:
+def _experiment(experiment: Experiment, evaluations: Evaluations) -> Iterator[str]:
     repeats = f" ({experiment.paper} of the paper)" if experiment.paper else ""
     yield f"## {experiment.title}"
     yield f"{experiment.question}{repeats}"
@@ -38,6 +41,8 @@ def _experiment(experiment: Experiment) -> Iterator[str]:
     else:
         yield f"**All at {next(iter(compared))}**, the one decoding of this experiment:"
     yield comparison_table(experiment, experiment.own_best)
+    yield "**Safety**, with the difference from the reference; less is better:"
+    yield safety_table(experiment, experiment.own_best, evaluations)
     if told := ordering(experiment):
         yield f"Against {experiment.labels[experiment.versus]}, {told}."
     if remarks := [
@@ -71,6 +76,29 @@ def comparison_table(experiment: Experiment, comparison: Comparison) -> str:
             entry = against.get(record["method"], {})
             row.append(difference(entry.get("realism_difference"), entry.get("ci95")))
     return to_markdown(titles, [*rows, *_published(experiment, titles)])
+
+
+def safety_table(experiment: Experiment, comparison: Comparison, evaluations: Evaluations) -> str:
+    """Rates of every method, first those that neither the distance nor the metric sees (``docs/safety.md``).
+
+    Args:
+        experiment: that it is of.
+        comparison: one of its two.
+        evaluations: figures of every scene; without them the differences have no intervals and are left out.
+    """
+    records, base = comparison.records(), comparison.base()
+    names = {key: name for group in groups_of(experiment).values() for key, name in group.items()}
+    shown = measured(records, names)
+    rows = []
+    for record in records:
+        mine = comparison.of(record["method"], decoding_of(record))
+        cells = []
+        for key in shown:
+            found = None if mine == base else paired_figure(mine, base, key, evaluations)
+            change = "" if found is None else f" ({difference(found.mean, (found.low, found.high))})"
+            cells.append(number(record.get(key), 3) + change)
+        rows.append([experiment.labels[record["method"]], *cells])
+    return to_markdown(["method", *(names[key] for key in shown)], rows)
 
 
 def _published(experiment: Experiment, titles: Sequence[str]) -> Iterator[list[str]]:

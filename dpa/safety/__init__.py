@@ -1,4 +1,4 @@
-"""Safety of rollouts by measures that neither the preference distance nor the realism metric knows."""
+"""Safety of rollouts by measures of their own: two that the preference distance and the metric know nothing of."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes and rollouts of an experiment's policies, to play on the page and as a picture (figures 5, 8 and 9)."""
+"""Scenes and rollouts of an experiment's policies, to play on the page and as a picture (figures 5 and 9)."""
 
 from __future__ import annotations
 

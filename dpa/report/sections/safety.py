@@ -1,8 +1,9 @@
-"""Safety of an experiment's methods: what neither the ranking nor the metric sees, and apart from it what both see."""
+"""Safety of an experiment's methods, by who else sees it: nobody, the preference distance, the metric, or both."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 from dpa.report.experiment import Comparison, Experiment, decoding_of, in_words
 from dpa.report.markup import Html, element, hint, joined, table
@@ -10,9 +11,9 @@ from dpa.report.paired import paired_figure, quiet_change
 from dpa.report.study import Evaluations
 from dpa.report.table import REFERENCE, number
 
-UNSEEN = {
-    "wrong_way": "wrong way", "red_light": "red light", "close_pass": "close pass", "harsh_jerk": "harsh jerk",
-}  # fmt: skip
+UNSEEN = {"wrong_way": "wrong way", "red_light": "red light"}
+RELATED = {"close_pass": "close pass", "harsh_jerk": "harsh jerk"}
+"""Computed otherwise than the features of the distance, but relatives of its clearance and effort."""
 SEEN = {"collision_rate": "collision", "offroad_rate": "off-road"}
 """In the paper's features of the preference distance, and in the metric."""
 RED_LIGHTS = "2025"
@@ -27,15 +28,11 @@ def safety_tables(experiment: Experiment, comparison: Comparison, evaluations: E
         comparison: one of its two.
         evaluations: figures of every scene.
     """
-    unseen, weighed = dict(UNSEEN), {}
-    if experiment.metric.startswith(RED_LIGHTS):
-        weighed = {"red_light": unseen.pop("red_light")}
-    groups = (
-        ("Safety that neither the preference distance nor the metric sees", unseen),
-        (f"Safety that the metric of {experiment.metric} sees, and the preference distance does not", weighed),
-        ("Safety that both the preference distance and the metric see", SEEN),
-    )
-    shown = [(title, found) for title, keys in groups if (found := _table(experiment, comparison, evaluations, keys))]
+    shown = [
+        (title, found)
+        for title, keys in groups_of(experiment).items()
+        if (found := _table(experiment, comparison, evaluations, keys))
+    ]
     if not shown:
         return Html("")
     note = (
@@ -45,22 +42,44 @@ def safety_tables(experiment: Experiment, comparison: Comparison, evaluations: E
     return joined([*(joined([element("h3", title), found]) for title, found in shown), hint(note)])
 
 
+def groups_of(experiment: Experiment) -> dict[str, Mapping[str, str]]:
+    """Measures of safety and what they are called, by who sees them.
+
+    Args:
+        experiment: whose metric may see more than that of other years.
+    """
+    unseen, weighed = dict(UNSEEN), {}
+    if experiment.metric.startswith(RED_LIGHTS):
+        weighed = {"red_light": unseen.pop("red_light")}
+    return {
+        "Safety that neither the preference distance nor the metric sees": unseen,
+        "Relatives of the distance's clearance and effort, measured otherwise": RELATED,
+        f"Safety that the metric of {experiment.metric} sees, and the preference distance does not": weighed,
+        "Safety that both the preference distance and the metric see": SEEN,
+    }
+
+
+def measured(records: Sequence[Mapping[str, Any]], keys: Iterable[str]) -> list[str]:
+    """Those that some record has a value of."""
+    return [key for key in keys if any(record.get(key) is not None for record in records)]
+
+
 def _table(
     experiment: Experiment, comparison: Comparison, evaluations: Evaluations, keys: Mapping[str, str]
 ) -> Html | None:
     """One group of measures; None where nothing of it was measured."""
     records = [record for method in experiment.methods for record in comparison.records() if record["method"] == method]
-    measured = [key for key in keys if any(record.get(key) is not None for record in records)]
-    if not measured:
+    shown = measured(records, keys)
+    if not shown:
         return None
     base, rows = comparison.base(), []
     for record in records:
         mine = comparison.of(record["method"], decoding_of(record))
         name, cells = experiment.labels[record["method"]], []
-        for key in measured:
+        for key in shown:
             found = None if mine == base else paired_figure(mine, base, key, evaluations)
             cells.append(joined([number(record.get(key), 3), quiet_change(found)], ""))
         if record["method"] == REFERENCE and mine != base:
             name += f", {in_words(decoding_of(record))}"
         rows.append([name, *cells])
-    return table(["method", *(f"{keys[key]}\N{NO-BREAK SPACE}↓" for key in measured)], rows)
+    return table(["method", *(f"{keys[key]}\N{NO-BREAK SPACE}↓" for key in shown)], rows)

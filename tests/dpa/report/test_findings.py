@@ -54,6 +54,21 @@ def test_what_sampling_alone_does_is_said(found: Experiment) -> None:
     assert any(f"moves the reference by +{max(sharper):.3f} at best" in note for note in reservations(found))
 
 
+def test_a_grid_of_one_temperature_is_said(found: Experiment) -> None:
+    told = "Of decodings only top-p was varied, at temperature 1."
+    assert told not in reservations(found)
+    tuning = [row for row in found.tuning if row["temperature"] == 1]
+    assert told in reservations(dataclasses.replace(found, tuning=tuning))
+
+
+def test_a_rival_at_the_edge_of_the_grid_is_said_too(found: Experiment) -> None:
+    inside, edge = (0.9, 1.0), (0.8, 1.0)
+    tuning = [{**found.tuning[0], "top_p": top_p, "temperature": 1.0} for top_p in (0.8, 0.9, 1.0)]
+    chosen = dict.fromkeys(found.methods, inside) | {"adversarial_afd": edge}
+    notes = reservations(dataclasses.replace(found, chosen=chosen, tuning=tuning))
+    assert any("of the 3 decodings tried: adversarial AFD (top-p 0.8); one beyond" in note for note in notes)
+
+
 def test_a_decoding_at_the_edge_of_the_grid_is_said(found: Experiment) -> None:
     def told(*grid: tuple[float, float]) -> bool:
         """Of a grid whose first decoding was chosen."""

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from dpa.report.experiment import read_experiment
+from dpa.report.paired import RESAMPLES
+from dpa.report.statistics import paired_bootstrap
 from dpa.report.table import difference, number
 from recipes.report import report
-from tests.dpa.report.runs import COMMON, write_experiment, write_runs
+from tests.dpa.report.runs import BEST, COMMON, SEEDS, values, write_experiment, write_runs
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +75,25 @@ def test_what_was_sampled_in_one_way_alone_has_one_table(tmp_path: Path) -> None
     assert told.count("| method | steps |") == 1 and "**Each" not in told and "common decoding" not in told
     rows = rows_of(told, "**All at top-p 0.95**, the one decoding")
     assert list(rows) == ["reference", "DPA-OMF", "DPA-ADEF"] and "Δ to DPA-OMF" in rows["DPA-ADEF"]
+
+
+def test_safety_has_rates_with_their_differences(runs: Path, text: str) -> None:
+    methods = read_experiment(runs / "experiments" / "methods.json")
+    table = rows_of(block(text, methods.title), "**Safety**")
+    assert list(table["reference"])[1:] == [
+        "wrong way",
+        "red light",
+        "close pass",
+        "harsh jerk",
+        "collision",
+        "off-road",
+    ]
+    mine, base = ([values(name, seed, BEST)["harsh_jerk"] for seed in SEEDS] for name in ("dpa_omf", "reference"))
+    both = np.array([mine, base], dtype=float)
+    both = both[:, :, ~np.isnan(both).any((0, 1))]
+    change = paired_bootstrap(both[0], both[1], RESAMPLES)
+    cell = f"{np.nanmean(np.array(mine, dtype=float)):.3f} ({difference(change.mean, (change.low, change.high))})"
+    assert table["DPA-OMF"]["harsh jerk"] == [cell]
 
 
 def test_likelihoods_are_means_over_seeds(runs: Path, text: str) -> None:
