@@ -11,9 +11,6 @@ from dpa.report.markup import Html, quiet
 from dpa.report.statistics import Interval, paired_bootstrap
 from dpa.report.study import Evaluations
 
-RESAMPLES = 2_000
-"""Draws for an interval: its ends are read to two digits, and a page has hundreds of them."""
-
 
 def paired_figure(
     mine: Sequence[Mapping[str, Any]], base: Sequence[Mapping[str, Any]], key: str, evaluations: Evaluations
@@ -43,7 +40,7 @@ def paired_figure(
         return None
     both = np.array(values, dtype=float)
     both = both[:, :, ~np.isnan(both).any((0, 1))]
-    return None if both.shape[-1] == 0 else paired_bootstrap(both[0], both[1], RESAMPLES)
+    return None if both.shape[-1] == 0 else paired_bootstrap(both[0], both[1])
 
 
 def quiet_change(found: Interval | None, digits: int = 3) -> Html:

@@ -7,15 +7,16 @@ were sampled: the training runs (seeds) and the scenes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 SCENES, SEEDS_AND_SCENES = "scenes", "seeds and scenes"
-_COUNTS_AT_ONCE = 10_000_000
-"""Bound on the counts (resamples x scenes) held at one time: 80 MB."""
+_COUNTS_AT_ONCE, _COUNTS_KEPT = 10_000_000, 2_000_000
+"""Bounds on the counts (resamples x scenes) held at one time, 80 MB, and kept for the next interval, 16 MB."""
 
 
 @dataclass(frozen=True)
@@ -182,13 +183,26 @@ def _bootstrap(values: NDArray[np.float64], num_resamples: int, seed: int) -> In
     if num_resamples < 1:
         raise ValueError(f"num_resamples must be at least 1, got {num_resamples}.")
     num_seeds, num_scenes = values.shape
-    rng, means = np.random.default_rng(seed), []
-    chunk = max(1, _COUNTS_AT_ONCE // num_scenes)
-    for done in range(0, num_resamples, chunk):
-        draws = min(chunk, num_resamples - done)
-        scenes = rng.multinomial(num_scenes, np.full(num_scenes, 1 / num_scenes), size=draws)
-        seeds = rng.multinomial(num_seeds, np.full(num_seeds, 1 / num_seeds), size=draws)
-        means.append(np.einsum("rk,kn,rn->r", seeds, values, scenes, optimize=True) / values.size)
+    drawn = _kept_draws if num_resamples * num_scenes <= _COUNTS_KEPT else _draws
+    means = [
+        np.einsum("rk,kn,rn->r", seeds, values, scenes, optimize=True) / values.size
+        for seeds, scenes in drawn(num_seeds, num_scenes, num_resamples, seed)
+    ]
     low, high = np.quantile(np.concatenate(means), [0.025, 0.975])
     over = SCENES if num_seeds == 1 else SEEDS_AND_SCENES
     return Interval(float(values.mean()), float(low), float(high), over, num_seeds, num_scenes)
+
+
+def _draws(num_seeds: int, num_scenes: int, num_resamples: int, seed: int) -> Iterator[tuple[NDArray, NDArray]]:
+    """How often each seed and each scene was drawn in each resample, ``[draws, seeds]`` and ``[draws, scenes]``."""
+    rng, chunk = np.random.default_rng(seed), max(1, _COUNTS_AT_ONCE // num_scenes)
+    for done in range(0, num_resamples, chunk):
+        draws = min(chunk, num_resamples - done)
+        scenes = rng.multinomial(num_scenes, np.full(num_scenes, 1 / num_scenes), size=draws)
+        yield rng.multinomial(num_seeds, np.full(num_seeds, 1 / num_seeds), size=draws), scenes
+
+
+@lru_cache(maxsize=4)
+def _kept_draws(*shape: int) -> list[tuple[NDArray, NDArray]]:
+    """A page has hundreds of intervals over the same seeds and scenes, and the same draws serve them all."""
+    return list(_draws(*shape))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dpa.report.paired import RESAMPLES, paired_figure, quiet_change
+from dpa.report.paired import paired_figure, quiet_change
 from dpa.report.statistics import Interval, paired_bootstrap
 from dpa.report.study import Evaluations
 
@@ -32,7 +32,7 @@ def rows(*files: str) -> list[dict[str, Any]]:
 
 def test_only_scenes_that_all_runs_have_a_value_for_count_and_seeds_are_paired(evaluations: Evaluations) -> None:
     found = paired_figure(rows("a0", "a1"), rows("b0", "b1")[::-1], "rate", evaluations)
-    expected = paired_bootstrap([[0.5, 0.7], [0.6, 0.7]], [[0.4, 0.5], [0.4, 0.6]], RESAMPLES)
+    expected = paired_bootstrap([[0.5, 0.7], [0.6, 0.7]], [[0.4, 0.5], [0.4, 0.6]])
     assert found == expected
     assert found.mean == pytest.approx(np.mean([0.1, 0.2, 0.2, 0.1])) and found.num_scenes == 2
 

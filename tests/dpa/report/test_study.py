@@ -14,7 +14,6 @@ import pytest
 
 from dpa.report.charts import _rounded
 from dpa.report.page import write_study
-from dpa.report.paired import RESAMPLES
 from dpa.report.statistics import paired_bootstrap
 from dpa.report.study import read_study
 from dpa.report.table import difference, number, signed
@@ -69,7 +68,7 @@ def paired(key: str, method: str, other: str, decoding: tuple[float, float]) -> 
     """Difference of a figure with its interval, from the values of every scene."""
     mine, base = (np.array([values(m, s, decoding)[key] for s in SEEDS], dtype=float) for m in (method, other))
     known = ~np.isnan([*mine, *base]).any(0)
-    found = paired_bootstrap(mine[:, known], base[:, known], RESAMPLES)
+    found = paired_bootstrap(mine[:, known], base[:, known])
     return stacked(found.mean, (found.low, found.high))
 
 
@@ -241,7 +240,7 @@ def test_likelihood_is_a_table_that_names_its_files(page: Page) -> None:
     assert cells[3:5] == ["1.700−0.300[−0.300, −0.300]", "2.500+0.400[+0.400, +0.400]"]
     assert cells[5:7] == ["4.0000.000[0.000, 0.000]", "1.9000.000[0.000, 0.000]"]
     scenes = np.tile(0.3 + np.linspace(-0.1, 0.1, 12), (3, 1))
-    kl = paired_bootstrap(scenes, 0 * scenes, RESAMPLES)
+    kl = paired_bootstrap(scenes, 0 * scenes)
     assert cells[7] == "0.3000" + stacked(kl.mean, (kl.low, kl.high), 4)
     assert "seed_2/dpa_omf/likelihood_eval.json" in cells[8]
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from dpa.report.experiment import read_experiment
-from dpa.report.paired import RESAMPLES
 from dpa.report.statistics import paired_bootstrap
 from dpa.report.table import difference, number
 from recipes.report import report
@@ -91,7 +90,7 @@ def test_safety_has_rates_with_their_differences(runs: Path, text: str) -> None:
     mine, base = ([values(name, seed, BEST)["harsh_jerk"] for seed in SEEDS] for name in ("dpa_omf", "reference"))
     both = np.array([mine, base], dtype=float)
     both = both[:, :, ~np.isnan(both).any((0, 1))]
-    change = paired_bootstrap(both[0], both[1], RESAMPLES)
+    change = paired_bootstrap(both[0], both[1])
     cell = f"{np.nanmean(np.array(mine, dtype=float)):.3f} ({difference(change.mean, (change.low, change.high))})"
     assert table["DPA-OMF"]["harsh jerk"] == [cell]
 
