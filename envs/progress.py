@@ -65,6 +65,20 @@ def stage(name: str) -> Iterator[None]:
         _stages.reset(token)
 
 
+def full_name(description: str) -> str:
+    """What a bar is called here: the names of the surrounding :func:`stage`, then its own.
+
+    Args:
+        description: what is counted.
+
+    Examples:
+        >>> with stage("align 0 dpo"):
+        ...     full_name("ipo")
+        'align 0 dpo > ipo'
+    """
+    return " > ".join((*_stages.get(), description))
+
+
 def progress(
     iterable: Iterable | None = None,
     description: str = "",
@@ -104,7 +118,7 @@ def progress(
     terminal = stream.isatty()
     return tqdm(
         iterable,
-        desc=" > ".join((*_stages.get(), description)),
+        desc=full_name(description),
         total=total,
         initial=initial,
         unit=unit,

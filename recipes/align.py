@@ -25,7 +25,7 @@ from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimiz
 from dpa.training.run import Run
 from dpa.training.seeding import seed_everything
 from envs.files import write_json
-from envs.progress import message
+from envs.progress import full_name, message
 from envs.seeding import make_generator
 from envs.store import SceneStore
 from recipes.alignment.candidates import Candidates, make_candidates
@@ -39,6 +39,8 @@ from recipes.common.scenes import fingerprint, open_splits
 
 OBSERVING = ("checkpoint_interval", "max_rows", "snapshots", "watch_interval", "watch_scenes", "watch_pairs")
 """Options of the section ``alignment`` that change nothing about the policy."""
+SATURATED = "saturated"
+"""Entry of ``result.json`` that only a run with a saturated loss has: the warning."""
 
 
 def align(
@@ -54,6 +56,7 @@ def align(
     expert: Path | None = None,
     watch: Watch | None = None,
     among: Sequence[int] | None = None,
+    section: str = "method",
 ) -> Path:
     """Fine-tune a policy with one method.
 
@@ -72,6 +75,7 @@ def align(
         expert: folder of the store with the rollouts of an expert (``data.kind: expert``).
         watch: what is looked at every ``alignment.watch_interval`` steps, for the curves ``tune/*``.
         among: indices of the scenes to learn from; by default all that the preferences are of.
+        section: where ``method`` stands in the configuration of the command, for what is told of its options.
 
     Returns:
         The file of the aligned policy.
@@ -98,9 +102,11 @@ def align(
         "expert": None if played is None else asdict(played.provenance),
     }
     snapshots = {step: folder / f"step_{step}" / "policy.pt" for step in options.snapshots if step <= options.steps}
-    if ranks.agree(finished(result, decided_by) is not None and path.is_file(), "finished =", folder):
+    kept = finished(result, decided_by)
+    if ranks.agree(kept is not None and path.is_file(), "finished =", folder):
         check_kept(snapshots, options.steps)
         check_written(path)
+        tell(method, (kept or {}).get(SATURATED), ranks)
         return path
     seed_everything(seed)
     candidates = make_candidates(method.data, store, scenes, context, model.tokenizer.cpu(), seed, played, learnt)
@@ -109,7 +115,6 @@ def align(
     loss = ranks.wrap(make_loss(method.loss, model.to(device)))
     optimizer = make_optimizer(model, options.lr, options.weight_decay)
     schedule = make_schedule(optimizer, options.steps, options.warmup)
-    saturation = SaturationWatch(method.loss)
     order = ShuffledOrder(len(candidates), options.scenes_per_step, seed)
     run = Run(
         folder,
@@ -123,8 +128,10 @@ def align(
         ranks=ranks,
     )
     check_kept(snapshots, run.first_step)
+    saturation = SaturationWatch(method.loss, f"{section}.loss", run.state.setdefault(SATURATED, {}))
     described = {"method": method.name, "seed": seed, "options": decided_by}
     with run:
+        tell(method, saturation.found, ranks)
         if look is not None and run.first_step == 0:
             run.log(look(device), 0)
         for step in run.steps():
@@ -132,8 +139,7 @@ def align(
             groups = [candidates[i] for i in order(step)]
             losses = accumulate_gradients(loss, parts_of(groups, options, draw, device, ranks), ranks)
             norm = clip_and_step(optimizer, options.max_norm, schedule)
-            if (warning := saturation(step, losses)) and ranks.main:
-                message(warning)
+            tell(method, saturation(step, losses), ranks)
             run.log({f"train/{key}": value for key, value in losses.items()} | {"train/gradient_norm": norm})
             done = step + 1
             if look is not None and (done % options.watch_interval == 0 or done == options.steps):
@@ -143,9 +149,16 @@ def align(
     if ranks.main:
         write_policy(path, model, config, described)
         last = {name: finite(curve["value"][-1]) for name, curve in read_curves(folder).items()}
-        write_json(result, {"options": decided_by, "policy": str(path), "last_step": last})
+        warned = {} if saturation.found is None else {SATURATED: saturation.found}
+        write_json(result, {"options": decided_by, "policy": str(path), "last_step": last, **warned})
     ranks.wait()
     return path
+
+
+def tell(method: DictConfig, warning: str | None, ranks: Ranks) -> None:
+    """Say what is wrong with a run, if anything is, under the name of its bar: others may write beside it."""
+    if warning is not None and ranks.main:
+        message(f"{full_name(method.name)}: {warning}")
 
 
 def check_kept(snapshots: Mapping[int, Path], done: int) -> None:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, MutableMapping
 from typing import Any
 
 WINDOW = 10
@@ -21,6 +20,9 @@ class SaturationWatch:
 
     Args:
         options: of the loss; ``link``, ``alpha``, ``score_reduction`` and ``reference`` are read where it has them.
+        section: where the command's configuration has them; the warning names them there.
+        state: plain values that the watch keeps up to date and goes on from. One that a run keeps in its checkpoints
+            makes a resumed run find what an uninterrupted one does.
 
     Examples:
         >>> watch = SaturationWatch({"alpha": 1.0, "reference": True, "score_reduction": "token_mean"})
@@ -29,10 +31,21 @@ class SaturationWatch:
         clear the preference is. Lower method.loss.alpha=1.0 to 0.2.
     """
 
-    def __init__(self, options: Mapping[str, Any]) -> None:
-        self.options = options
-        self._steps: deque[tuple[int, float]] = deque(maxlen=WINDOW)
-        self._warned = False
+    def __init__(
+        self,
+        options: Mapping[str, Any],
+        section: str = "method.loss",
+        state: MutableMapping[str, Any] | None = None,
+    ) -> None:
+        self.options, self.section = options, section
+        self._state = {} if state is None else state
+        self._state.setdefault("found", None)
+        self._state.setdefault("window", [])
+
+    @property
+    def found(self) -> str | None:
+        """The warning, once it was given."""
+        return self._state["found"]
 
     def __call__(self, step: int, figures: Mapping[str, Any]) -> str | None:
         """Take in one step.
@@ -45,26 +58,26 @@ class SaturationWatch:
         Returns:
             The warning, or None.
         """
-        if self._warned or "saturated" not in figures or self.options.get("link", "logistic") != "logistic":
+        if self.found or "saturated" not in figures or self.options.get("link", "logistic") != "logistic":
             return None
-        self._steps.append((step, float(figures["saturated"])))
-        share = sum(value for _, value in self._steps) / len(self._steps)
-        if share <= TOO_MANY or (step > 0 and len(self._steps) < WINDOW):
+        window = self._state["window"] = [*self._state["window"], [step, float(figures["saturated"])]][-WINDOW:]
+        share = sum(value for _, value in window) / len(window)
+        if share <= TOO_MANY or (step > 0 and len(window) < WINDOW):
             return None
-        self._warned = True
-        return (
-            f"{100 * share:.0f} % of the pairs are saturated since step {self._steps[0][0] + 1}: their weight follows "
+        self._state["found"] = (
+            f"{100 * share:.0f} % of the pairs are saturated since step {window[0][0] + 1}: their weight follows "
             f"how likely their rollouts are, not how clear the preference is. {self._advice(figures)}."
         )
+        return self.found
 
     def _advice(self, figures: Mapping[str, Any]) -> str:
         ways = []
         if self.options.get("reference") is False:
-            ways.append("say method.loss.reference=true")
+            ways.append(f"say {self.section}.reference=true")
         if self.options.get("score_reduction") != "token_mean":
-            ways.append("say method.loss.score_reduction=token_mean")
+            ways.append(f"say {self.section}.score_reduction=token_mean")
         if "alpha" in self.options:
-            ways.append(f"lower method.loss.alpha={self.options['alpha']} to {self._smaller_alpha(figures):g}")
+            ways.append(f"lower {self.section}.alpha={self.options['alpha']} to {self._smaller_alpha(figures):g}")
         text = ", or ".join(ways) or "make its scores smaller"
         return text[0].upper() + text[1:]
 

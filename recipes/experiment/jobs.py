@@ -81,6 +81,7 @@ def align_job(cfg: DictConfig, seed: int, method: str) -> dict[str, float]:
             expert=None if setup.expert is None else runs.preferences(seed, "train", setup.expert),
             watch=Watch(splits.tune, runs.preferences(seed, "tune"), runs.policy(seed, REFERENCE)),
             among=learnt_from(cfg, len(splits.train)),
+            section=f"methods.{method}",
         )
     return {"align": seconds_trained(folder)}
 

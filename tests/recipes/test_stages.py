@@ -28,7 +28,7 @@ from dpa.realism.submission import validate
 from dpa.tokens import VerletTokenizer
 from dpa.training.checkpoint import load_policy
 from dpa.training.loggers import read_curve
-from dpa.training.optim import accumulate_gradients
+from dpa.training.optim import accumulate_gradients, clip_and_step
 from envs import keys
 from envs.scene import CURRENT_STEP
 from envs.sources.synthetic import straight_road
@@ -44,6 +44,7 @@ from recipes.common.partial import PartialResult
 from recipes.common.rolled import Rolled
 from recipes.common.scenes import open_splits
 from recipes.evaluate import SCENE_FIGURES, final_spread, standing_moved
+from recipes.experiment.jobs import align_job
 from recipes.experiment.pool import Job, Workers
 
 METHODS = ("dpa_omf", "dpa_adef", "sft_best_oa", "sft_best_ade", "adversarial_afd")
@@ -526,7 +527,9 @@ def _interrupting(step: int) -> type:
     """A watch for saturation during which somebody presses Ctrl-C."""
 
     class Interrupting:
-        def __init__(self, options: object) -> None: ...
+        found = None
+
+        def __init__(self, *options: object) -> None: ...
 
         def __call__(self, now: int, figures: object) -> None:
             if now == step:
@@ -577,13 +580,79 @@ def test_alignment_learns_from_the_scenes_that_it_is_given(runs: Path, options: 
         assert torch.equal(group.preferred, whole.preferred)
 
 
-def test_a_loss_that_saturates_is_told_once(run: Callable, options: Callable, runs: Path, tmp_path: Path) -> None:
-    given = ["method=cpl", "method.data.num=2", "method.loss.alpha=1000", f"output={tmp_path / 'cpl'}"]
-    given += [f"policy={runs / 'reference/policy.pt'}", f"preferences={runs / 'preferences'}"]
-    outcome = run("align", *options("align", *given))
+def saturating(runs: Path, options: Callable, folder: Path) -> list[str]:
+    given = ["method=cpl", "method.data.num=2", "method.loss.alpha=1000", f"output={folder}"]
+    return options("align", *given, f"policy={runs / 'reference/policy.pt'}", f"preferences={runs / 'preferences'}")
+
+
+def warnings_in(err: str) -> list[str]:
+    return [line for line in err.splitlines() if "of the pairs are saturated" in line]
+
+
+def test_a_loss_that_saturates_is_told_once_and_kept_with_the_result(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path
+) -> None:
+    command = saturating(runs, options, tmp_path / "cpl")
+    outcome = run("align", *command)
     assert outcome.status == 0, outcome.err
-    assert outcome.err.count("of the pairs are saturated since step 1:") == 1
-    assert "method.loss.reference=true" in outcome.err
+    (told,) = warnings_in(outcome.err)
+    assert re.match(r"cpl: \d+ % of the pairs are saturated since step 1: .* method\.loss\.reference=true", told)
+    kept = json.loads((tmp_path / "cpl/result.json").read_text())["saturated"]
+    assert told == f"cpl: {kept}"
+    assert warnings_in(run("align", *command).err) == [told], "a finished run tells it again"
+
+
+def test_a_run_that_goes_on_tells_again_what_saturated_before_it_was_interrupted(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path
+) -> None:
+    command = saturating(runs, options, tmp_path / "cpl")
+    with mock.patch("recipes.align.clip_and_step", _interrupted_after(3)):
+        first = run("align", *command)
+    assert first.status == 130
+    (told,) = warnings_in(first.err)
+    outcome = run("align", *command)
+    assert outcome.status == 0 and warnings_in(outcome.err) == [told]
+    assert told.endswith(json.loads((tmp_path / "cpl/result.json").read_text())["saturated"])
+
+
+def _interrupted_after(steps: int) -> Callable:
+    """Steps of the optimiser during which somebody presses Ctrl-C."""
+    left = iter(range(steps))
+
+    def step(*arguments: object) -> float:
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+        return clip_and_step(*arguments)
+
+    return step
+
+
+def test_a_loss_that_does_not_saturate_leaves_no_mark(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path
+) -> None:
+    outcome = run("align", *watched(runs, options, tmp_path / "omf"))
+    assert outcome.status == 0 and not warnings_in(outcome.err)
+    assert "saturated" not in json.loads((tmp_path / "omf/result.json").read_text())
+
+
+def test_a_comparison_names_the_run_that_saturates_and_its_options(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    folder = tmp_path / "study"
+    shutil.copytree(runs / "reference", folder / "seed_0/reference")
+    shutil.copytree(runs / "preferences", folder / "seed_0/preferences_train")
+    tuned = [*collect_into(folder / "seed_0/preferences_tune", runs, options), "split=tune"]
+    assert run("collect", *tuned).status == 0
+    with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):
+        given = [f"output={folder}", "experiment=losses", "methods.smoothed.data.num=2"]
+        given += ["methods.smoothed.loss.reference=false", "methods.smoothed.loss.alpha=1000.0"]
+        cfg = compose("compare", options("compare", *given))
+    with Workers(1, 1) as workers:
+        list(workers.run([Job(align_job, (cfg, 0, "smoothed"), "align 0 smoothed")], "align"))
+    (told,) = warnings_in(capsys.readouterr().err)
+    assert told.startswith("align 0 smoothed > dpo: ")
+    assert " Say methods.smoothed.loss.reference=true, or " in told
+    assert re.search(r" or lower methods\.smoothed\.loss\.alpha=1000\.0 to \S+\.$", told)
 
 
 def test_a_step_is_the_same_however_it_is_split_into_parts() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import pytest
@@ -41,6 +42,26 @@ def test_half_of_the_pairs_is_not_too_many() -> None:
 def test_a_run_that_goes_on_waits_for_enough_steps() -> None:
     told = said(SaturationWatch(PLAIN), [1.0] * 30, first=40)
     assert list(told) == [40 + WINDOW - 1]
+
+
+def test_a_resumed_watch_finds_what_an_uninterrupted_one_does() -> None:
+    shares = [0.0] * 5 + [1.0] * 30
+    kept: dict = {}
+    assert not said(SaturationWatch(PLAIN, state=kept), shares[:8])
+    kept = json.loads(json.dumps(kept))  # as in a checkpoint
+    resumed = said(SaturationWatch(PLAIN, state=kept), shares[8:], first=8)
+    assert resumed == said(SaturationWatch(PLAIN), shares)
+    again = SaturationWatch(PLAIN, state=kept)
+    assert again.found == resumed[WINDOW]
+    assert not said(again, [1.0] * 30, first=40), "once"
+
+
+def test_options_are_named_where_the_command_has_them() -> None:
+    text = SaturationWatch(PLAIN, "methods.cpl.loss")(0, figures(0.9))
+    assert text.endswith(
+        "Say methods.cpl.loss.reference=true, or say methods.cpl.loss.score_reduction=token_mean, or lower "
+        "methods.cpl.loss.alpha=0.1 to 0.01."
+    )
 
 
 def test_imitation_is_never_told_off() -> None:
