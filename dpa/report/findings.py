@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
-from dpa.report.experiment import Decoding, Experiment, decoding_of, in_words
+from dpa.report.experiment import Decoding, Experiment, decoding_of, in_words, read_json
 from dpa.report.statistics import SCENES
 from dpa.report.table import REFERENCE, signed
 
@@ -121,6 +122,27 @@ def budgets(experiment: Experiment) -> str | None:
         return None
     each = "; ".join(f"{', '.join(labels)}: {told}" for told, labels in alike.items())
     return f"Budgets differ. Over that of {experiment.labels[base]}, {each}."
+
+
+def saturated(experiment: Experiment, folder: Path) -> str | None:
+    """Which methods trained with a loss that no longer weighed preferences; None where no run says so.
+
+    Args:
+        experiment: whose runs are asked; a run without a ``result.json`` in the folder says nothing.
+        folder: of the study.
+    """
+    told = []
+    for method, runs in experiment.curves.items():
+        results = [folder / run / "result.json" for run in runs.values()]
+        warned = sum("saturated" in read_json(result) for result in results if result.is_file())
+        if warned:
+            told.append(f"{experiment.labels[method]} ({warned} of {len(runs)} seeds)")
+    if not told:
+        return None
+    return (
+        f"Saturated: {', '.join(told)}. The weights of their pairs follow how likely rollouts are, not how clear the "
+        "preference is."
+    )
 
 
 def ordering(experiment: Experiment) -> str:

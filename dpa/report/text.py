@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 
 from dpa.report.experiment import Comparison, Experiment, decoding_of
-from dpa.report.findings import budgets, chosen_on_the_same, headline, left_out, ordering
+from dpa.report.findings import budgets, chosen_on_the_same, headline, left_out, ordering, saturated
 from dpa.report.paired import paired_figure
 from dpa.report.sections.likelihood import DIGITS, FIGURES
 from dpa.report.sections.safety import groups_of, measured
@@ -45,10 +45,14 @@ def _experiment(experiment: Experiment, evaluations: Evaluations) -> Iterator[st
     yield safety_table(experiment, experiment.own_best, evaluations)
     if told := ordering(experiment):
         yield f"Against {experiment.labels[experiment.versus]}, {told}."
-    if remarks := [
-        told for told in (budgets(experiment), chosen_on_the_same(experiment), left_out(experiment)) if told
-    ]:
-        yield " ".join(remarks)
+    remarks = (
+        budgets(experiment),
+        saturated(experiment, evaluations.folder),
+        chosen_on_the_same(experiment),
+        left_out(experiment),
+    )
+    if told := [remark for remark in remarks if remark]:
+        yield " ".join(told)
     if "common" in compared:
         yield "**All at the common decoding**, and the reference at the others:"
         yield comparison_table(experiment, experiment.at_common)

@@ -8,7 +8,7 @@ from typing import Any
 
 from dpa.report.charts import Chart, Difference, Line, curves, forest, gallery, lines
 from dpa.report.experiment import SAMPLED, Comparison, Experiment, decoding_against, decoding_of, in_words
-from dpa.report.findings import budgets, chosen_on_the_same, left_out, ordering
+from dpa.report.findings import budgets, chosen_on_the_same, left_out, ordering, saturated
 from dpa.report.markup import (
     Html,
     Section,
@@ -59,12 +59,12 @@ def experiment_section(experiment: Experiment, colours: Mapping[str, str], evalu
         f"realism metric of {experiment.metric}",
         *([f"in the paper: {experiment.paper}"] if experiment.paper else []),
     ]
-    unequal = budgets(experiment)
+    notes = [note for note in (budgets(experiment), saturated(experiment, evaluations.folder)) if note]
     body = [
         element("p", experiment.question, class_="question"),
         hint("; ".join(about) + "."),
         tabs(panels, f"decoding-{experiment.name}"),
-        *([element("p", unequal, class_="note")] if unequal else []),
+        *(element("p", note, class_="note") for note in notes),
         gallery([chart for chart in charts if chart is not None]),
         likelihood_table(experiment, evaluations),
         folded("command, configuration, versions and machine", _made(experiment)),

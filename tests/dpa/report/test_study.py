@@ -20,7 +20,7 @@ from dpa.report.table import difference, number, signed
 from recipes import report as recipe
 from recipes.report import report
 from tests.dpa.report.parsed import Page
-from tests.dpa.report.runs import AXIS, BEST, COMMON, SEEDS, label, values, write_experiment
+from tests.dpa.report.runs import AXIS, BEST, COMMON, SEEDS, label, values, write, write_experiment
 
 
 @pytest.fixture(scope="module")
@@ -362,6 +362,17 @@ def test_methods_that_train_on_more_are_named(copied: Path, tmp_path: Path) -> N
     page = Page(report(copied, tmp_path / "out").read_text(encoding="utf-8"))
     told = "Budgets differ. Over that of DPA-OMF, DPA-ADEF: 2 times the steps, 2 times the rollouts."
     assert page.text.count(told) == 2  # at the top, and beside the tables
+
+
+def test_methods_whose_loss_saturated_are_named_with_their_seeds(page: Page, copied: Path, tmp_path: Path) -> None:
+    for seed in SEEDS:
+        kept = {"saturated": "60 % of the pairs are saturated since step 1"} if seed else {}
+        for method, more in (("dpa_omf", {}), ("dpa_adef", kept)):
+            write(copied / f"seed_{seed}" / method / "result.json", {"options": {}, **more})
+    told = "Saturated: DPA-ADEF (2 of 3 seeds)."
+    assert Page(report(copied, tmp_path / "out").read_text(encoding="utf-8")).text.count(told) == 1
+    assert report(copied, tmp_path / "tables.md").read_text(encoding="utf-8").count(told) == 1
+    assert "Saturated: " not in page.text
 
 
 def test_what_the_papers_method_is_here_is_said_below_its_table(page: Page, copied: Path, tmp_path: Path) -> None:
