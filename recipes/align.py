@@ -28,10 +28,10 @@ from envs.files import write_json
 from envs.progress import full_name, message
 from envs.seeding import make_generator
 from envs.store import SceneStore
-from recipes.alignment.candidates import Candidates, make_candidates
+from recipes.alignment.candidates import SIDES, Candidates, make_candidates
 from recipes.alignment.draws import parts_of
 from recipes.alignment.losses import check_fit, make_loss
-from recipes.alignment.watch import Look, Watch
+from recipes.alignment.watch import ImitationLook, Look, Watch
 from recipes.common.cli import CONFIG, check_steps, deciding, finished, finite, plain, ranked_recipe
 from recipes.common.models import check_written, open_policy, weights_digest, write_policy
 from recipes.common.rankings import open_preferences
@@ -73,7 +73,8 @@ def align(
         folder: of the run; snapshots are kept in ``step_<step>`` inside.
         ranks: that train together; the scenes of a step are theirs together.
         expert: folder of the store with the rollouts of an expert (``data.kind: expert``).
-        watch: what is looked at every ``alignment.watch_interval`` steps, for the curves ``tune/*``.
+        watch: what is looked at every ``alignment.watch_interval`` steps, for the curves ``tune/*``. A method that
+            imitates is looked at as often, with or without it, for what a preference loss logs by itself.
         among: indices of the scenes to learn from; by default all that the preferences are of.
         section: where ``method`` stands in the configuration of the command, for what is told of its options.
 
@@ -111,7 +112,12 @@ def align(
     seed_everything(seed)
     candidates = make_candidates(method.data, store, scenes, context, model.tokenizer.cpu(), seed, played, learnt)
     check_enough(candidates, options.pairs_per_scene)
-    look = Look(watch, context, model.to(device), options) if watch is not None and ranks.main else None
+    looks: list[Look | ImitationLook] = []
+    if ranks.main and watch is not None:
+        looks.append(Look(watch, context, model.to(device), options))
+    if ranks.main and SIDES[method.data.kind] == "targets" and store.provenance.num_rollouts > 1:
+        own = method.data.rank_by, learnt
+        looks.append(ImitationLook(store, scenes, context, model.to(device), options, *own))
     loss = ranks.wrap(make_loss(method.loss, model.to(device)))
     optimizer = make_optimizer(model, options.lr, options.weight_decay)
     schedule = make_schedule(optimizer, options.steps, options.warmup)
@@ -132,7 +138,7 @@ def align(
     described = {"method": method.name, "seed": seed, "options": decided_by}
     with run:
         tell(method, saturation.found, ranks)
-        if look is not None and run.first_step == 0:
+        for look in looks if run.first_step == 0 else ():
             run.log(look(device), 0)
         for step in run.steps():
             draw = make_generator(seed, "pairs", step)
@@ -142,7 +148,7 @@ def align(
             tell(method, saturation(step, losses), ranks)
             run.log({f"train/{key}": value for key, value in losses.items()} | {"train/gradient_norm": norm})
             done = step + 1
-            if look is not None and (done % options.watch_interval == 0 or done == options.steps):
+            for look in looks if done % options.watch_interval == 0 or done == options.steps else ():
                 run.log(look(device))
             if ranks.main and done in snapshots:
                 write_policy(snapshots[done], model, config, described | {"step": done})

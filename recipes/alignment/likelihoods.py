@@ -23,6 +23,8 @@ PROBED = (
     "pair_accuracy", "reward_accuracy", "nll_demonstration", "nll_preferred", "nll_unpreferred", "entropy"
 )  # fmt: skip
 """What :func:`probe` measures of every scene."""
+SIDED = ("pair_accuracy", "nll_preferred", "nll_unpreferred")
+"""What :func:`probe_sides` measures of every scene."""
 
 
 class Probe(NamedTuple):
@@ -52,6 +54,7 @@ def make_probes(
     tokenizer: MotionTokenizer,
     pairs: int,
     rows: Iterable[int] | None = None,
+    rank_by: str = keys.DISTANCE,
 ) -> list[Probe]:
     """Probes from ranked rollouts.
 
@@ -62,9 +65,10 @@ def make_probes(
         tokenizer: of logs.
         pairs: M, at most half of the rollouts of a scene.
         rows: of the store; all by default.
+        rank_by: ``distance`` or ``ade``, which decides what is near.
     """
     contexts = Contexts(scenes, options)
-    near, far = nearest_farthest(store.distance, pairs)
+    near, far = nearest_farthest(store.distance if rank_by == keys.DISTANCE else store.ade, pairs)
     probes = []
     for row in range(len(store)) if rows is None else rows:
         context = contexts[int(store.scenes[row])]
@@ -103,21 +107,56 @@ def probe(model: MotionLM, reference: MotionLM, probes: Iterable[Probe], device:
     return [_probed(model, reference, each, device) for each in probes]
 
 
-def _probed(model: MotionLM, reference: MotionLM, each: Probe, device: str) -> dict[str, float]:
-    context = collate_contexts([each.context]).to(device)
-    tokens = torch.cat((each.preferred, each.unpreferred))[None].to(device)
-    valid = each.valid[None, None].to(device)
-    logits, before = (policy(context, tokens, valid) for policy in (model, reference))
-    now, then = ((token_log_prob(seen, tokens)[0] * valid[0]).sum((-1, -2)) for seen in (logits, before))
-    (near, far), (near_gain, far_gain) = now.chunk(2), (now - then).chunk(2)
-    log_tokens, log_valid = (value[None, None].to(device) for value in (each.demonstration, each.demonstration_valid))
-    log = token_log_prob(model(context, log_tokens, log_valid), log_tokens)
-    found = {
+@torch.no_grad()
+def probe_sides(model: MotionLM, probes: Iterable[Probe], device: str = "cpu") -> list[dict[str, float]]:
+    """Ask a policy about the rollouts of each probe alone: one pass, and none of a reference.
+
+    Args:
+        model: in whatever mode it is; dropout would count.
+        probes: of some scenes.
+        device: of the model.
+
+    Returns:
+        :data:`SIDED` for each probe, as :func:`probe` gives them.
+    """
+    found = []
+    for each in probes:
+        context, tokens, valid = _rollouts(each, device)
+        now = _log_prob(model(context, tokens, valid), tokens, valid)
+        found.append({name: value.item() for name, value in _sides(now, valid).items()})
+    return found
+
+
+def _rollouts(each: Probe, device: str) -> tuple[SceneContext, Tensor, Tensor]:
+    """Context, tokens ``[1, 2 * M, A, T]`` and validity ``[1, 1, A, T]``, the preferred rollouts first."""
+    tokens = torch.cat((each.preferred, each.unpreferred))[None]
+    return collate_contexts([each.context]).to(device), tokens.to(device), each.valid[None, None].to(device)
+
+
+def _log_prob(logits: Tensor, tokens: Tensor, valid: Tensor) -> Tensor:
+    """``[2 * M]``, of whole rollouts."""
+    return (token_log_prob(logits, tokens)[0] * valid[0]).sum((-1, -2))
+
+
+def _sides(now: Tensor, valid: Tensor) -> dict[str, Tensor]:
+    near, far = now.chunk(2)
+    return {
         "pair_accuracy": (near > far).double().mean(),
-        "reward_accuracy": ((near_gain > far_gain).double() + (near_gain == far_gain).double() / 2).mean(),
-        "nll_demonstration": -log[log_valid].mean(),
         "nll_preferred": -near.mean() / valid.sum(),
         "nll_unpreferred": -far.mean() / valid.sum(),
+    }
+
+
+def _probed(model: MotionLM, reference: MotionLM, each: Probe, device: str) -> dict[str, float]:
+    context, tokens, valid = _rollouts(each, device)
+    logits, before = (policy(context, tokens, valid) for policy in (model, reference))
+    now, then = (_log_prob(seen, tokens, valid) for seen in (logits, before))
+    near_gain, far_gain = (now - then).chunk(2)
+    log_tokens, log_valid = (value[None, None].to(device) for value in (each.demonstration, each.demonstration_valid))
+    log = token_log_prob(model(context, log_tokens, log_valid), log_tokens)
+    found = _sides(now, valid) | {
+        "reward_accuracy": ((near_gain > far_gain).double() + (near_gain == far_gain).double() / 2).mean(),
+        "nll_demonstration": -log[log_valid].mean(),
         "entropy": _mean(token_entropy(logits), valid),
         "kl": _mean(token_divergence(logits, before), valid),
     }

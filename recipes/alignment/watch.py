@@ -1,8 +1,11 @@
-"""A look at a policy in training: scenes that no loss sees (figures 4 and 6 of the paper)."""
+"""Looks at a policy in training: at what no loss sees (figures 4 and 6 of the paper), or imitation does not see."""
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,8 +13,9 @@ from numpy import nanmean
 from omegaconf import DictConfig
 
 from dpa.policy import ContextOptions, MotionLM
+from dpa.preferences import PreferenceStore
 from envs.store import SceneStore
-from recipes.alignment.likelihoods import PROBED, make_probes, probe
+from recipes.alignment.likelihoods import PROBED, SIDED, make_probes, probe, probe_sides
 from recipes.common.models import open_policy
 from recipes.common.rankings import open_ranked_scenes
 
@@ -55,8 +59,56 @@ class Look:
 
     def __call__(self, device: str) -> dict[str, float]:
         """Means over the scenes, as curves are named."""
-        training = self.model.training
-        self.model.eval()
-        found = probe(self.model, self.reference, self.probes, device)
-        self.model.train(training)
+        with _without_dropout(self.model):
+            found = probe(self.model, self.reference, self.probes, device)
         return {f"tune/{name}": nanmean([each[name] for each in found]) for name in (*PROBED, "kl")}
+
+
+class ImitationLook:
+    """A look at what imitation is to bring apart: nearest and farthest rollouts of scenes that it learns from.
+
+    A preference loss reads both sides and logs these figures of each step; one that imitates reads the near side alone.
+
+    Args:
+        store: of the rollouts, two or more of each scene.
+        scenes: that it is of.
+        context: how scenes are cut up.
+        model: in training.
+        options: the section ``alignment``.
+        rank_by: ``distance`` or ``ade``, by which the method ranks.
+        learnt: indices of the scenes that the method learns from.
+    """
+
+    def __init__(
+        self,
+        store: PreferenceStore,
+        scenes: SceneStore,
+        context: ContextOptions,
+        model: MotionLM,
+        options: DictConfig,
+        rank_by: str,
+        learnt: Collection[int],
+    ) -> None:
+        among = set(learnt)
+        rows = (row for row, scene in enumerate(store.scenes.tolist()) if scene in among)
+        pairs = min(options.watch_pairs, store.provenance.num_rollouts // 2)
+        tokenizer = copy.deepcopy(model.tokenizer).cpu()  # logs are read on the CPU, wherever the model is
+        kept = list(islice(rows, options.watch_scenes))
+        self.probes = make_probes(store, scenes, context, tokenizer, pairs, kept, rank_by)
+        self.model = model
+
+    def __call__(self, device: str) -> dict[str, float]:
+        """Means over the scenes, as curves are named."""
+        with _without_dropout(self.model):
+            found = probe_sides(self.model, self.probes, device)
+        return {f"train/{name}": nanmean([each[name] for each in found]) for name in SIDED}
+
+
+@contextmanager
+def _without_dropout(model: MotionLM) -> Iterator[None]:
+    training = model.training
+    model.eval()
+    try:
+        yield
+    finally:
+        model.train(training)

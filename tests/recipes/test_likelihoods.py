@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from dpa.policy import ContextOptions, MotionLM, SceneContext, make_context
 from dpa.tokens import VerletTokenizer
 from envs.sources.synthetic import straight_road
-from recipes.alignment.likelihoods import Probe, divergence, probe
+from recipes.alignment.likelihoods import SIDED, Probe, divergence, probe, probe_sides
 
 V = 4
 
@@ -49,6 +49,16 @@ def test_a_policy_is_asked_for_the_likelihood_of_logs_and_of_both_sides() -> Non
     assert found["nll_preferred"] == pytest.approx((4 * nats[0] + 4 * nats[2]) / 8)
     assert found["nll_unpreferred"] == pytest.approx(nats[1])
     assert found["entropy"] == pytest.approx(sum(p * n for p, n in zip(probabilities, nats, strict=True)))
+
+
+def test_sides_alone_are_what_the_whole_probe_says_of_them(model: MotionLM) -> None:
+    draw = torch.Generator().manual_seed(0)
+    near, far = (torch.randint(60, 110, (3, 2, 16), generator=draw) for _ in range(2))
+    valid = torch.ones(2, 16, dtype=torch.bool)
+    valid[1, 9:] = False
+    asked = Probe(make_context(straight_road(2)), near[0], valid, near, far, valid)
+    (whole,), (sides,) = probe(model, model, [asked]), probe_sides(model, [asked])
+    assert sides == {name: whole[name] for name in SIDED}
 
 
 def test_a_log_without_tokens_has_no_likelihood() -> None:

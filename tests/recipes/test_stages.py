@@ -36,6 +36,7 @@ from envs.store import SceneStore
 from recipes import evaluate as evaluation
 from recipes.alignment.candidates import Group, make_candidates
 from recipes.alignment.draws import draw_rows, make_batch, parts_of
+from recipes.alignment.likelihoods import SIDED
 from recipes.alignment.losses import check_fit, make_loss
 from recipes.alignment.watch import Look, Watch
 from recipes.common.cli import CONFIG, plain
@@ -521,6 +522,48 @@ def test_scenes_that_no_loss_sees_are_looked_at_along_the_way(
     assert torch.equal(last, weights(tmp_path / "plain/policy.pt")), "looking changes nothing"
     assert torch.equal(last, weights(tmp_path / "omf/step_4/policy.pt"))
     assert not torch.equal(last, weights(tmp_path / "omf/step_2/policy.pt"))
+
+
+@pytest.mark.parametrize(("method", "rank_by"), [("sft_best_oa", "distance"), ("sft_best_ade", "ade")])
+def test_imitation_logs_how_likely_near_and_far_rollouts_of_its_own_scenes_are(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path, method: str, rank_by: str
+) -> None:
+    looks = [f"method={method}", "alignment.watch_scenes=3", "alignment.watch_pairs=1"]
+    assert run("align", *watched(runs, options, tmp_path / "sft", *looks)).status == 0
+    curves = {name: read_curve(tmp_path / "sft", f"train/{name}") for name in SIDED}
+    assert all([step for step, _ in curve] == [0, 2, 4] for curve in curves.values())
+
+    cfg = compose_recipe("align", options, runs)
+    store, scenes = PreferenceStore(runs / "preferences"), open_splits(cfg.scenes).train
+    for policy, place in (("reference", 0), ("sft", -1)):
+        model, context, _ = open_policy((tmp_path if place else runs) / policy / "policy.pt")
+        loss, found = ContrastivePreferenceLoss(token_network(model.eval())), []
+        for row in range(3):
+            seen = make_context(scenes[int(store.scenes[row])], context)
+            stored = store.read([row], num_agents=len(seen.kind))[0]
+            order = stored[rank_by].argsort()
+            near, far = (stored[keys.TOKENS][order[[rank]]] for rank in (0, -1))
+            pair = draw_rows(Group(seen, near, far, stored[keys.TOKEN_VALID]), 1, torch.Generator())
+            found.append(loss(make_batch([pair])))
+        for name, curve in curves.items():
+            wanted = sum(each[name].item() for each in found) / 3
+            assert curve[place][1] == pytest.approx(wanted, abs=1e-5), (policy, name)
+
+    seldom = [*watched(runs, options, tmp_path / "seldom", *looks), "alignment.watch_interval=4"]
+    assert run("align", *seldom).status == 0
+    sft, other = (weights(tmp_path / name / "policy.pt") for name in ("sft", "seldom"))
+    assert torch.equal(sft, other), "looking changes nothing"
+
+
+def test_imitation_of_single_rollouts_has_no_far_side_to_look_at(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path
+) -> None:
+    single = [*collect_into(tmp_path / "single", runs, options), "collection.num_rollouts=1"]
+    assert run("collect", *single).status == 0
+    given = ["method=sft_best_oa", f"preferences={tmp_path / 'single'}", f"output={tmp_path / 'sft'}"]
+    outcome = run("align", *options("align", *given, f"policy={runs / 'reference/policy.pt'}"))
+    assert outcome.status == 0, outcome.err
+    assert not (tmp_path / "sft/scalars/train/pair_accuracy.csv").exists()
 
 
 def _interrupting(step: int) -> type:
