@@ -268,10 +268,12 @@ def discriminator() -> dict[str, Any]:
 
 
 def players() -> dict[str, Any]:
-    """One scene with a rollout that is its log."""
+    """One scene: the reference's rollout is its log, DPA-OMF's falls behind."""
     scene = straight_road(2)
     scene.scene_id = "</script><b>made up"
-    return pack_players([PlayerScene(scene, {"reference": judged(scene, [slower(scene, 0)], [-1.0])})])
+    behind = {label(method): judged(scene, [slower(scene, metres)], [-1.0])
+              for method, metres in (("reference", 0), ("dpa_omf", 20))}  # fmt: skip
+    return pack_players([PlayerScene(scene, behind)])
 
 
 def write(path: Path, content: Any) -> None:

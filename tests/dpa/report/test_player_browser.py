@@ -12,66 +12,14 @@ import pytest
 from dpa.report.page import write_rollouts
 from envs.render import fit_view
 from tests.dpa.report.made_rollouts import made_players
+from tests.dpa.report.player_reader import SETTLE, Player
 
-COUNT = """([name, color]) => {
-  const canvas = document.getElementById("player-" + name);
-  const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d", {willReadFrequently: true});
-  copy.drawImage(canvas, 0, 0);
-  const {data} = copy.getImageData(0, 0, canvas.width, canvas.height);
-  let count = 0;
-  for (let i = 0; i < data.length; i += 4) {
-    const away = [0, 1, 2].map(k => Math.abs(data[i + k] - color[k]));
-    if (Math.max(...away) < 9) count++;
-  }
-  return count;
-}"""
 RING, ROAD = [227, 0, 27], [245, 159, 0]
-SETTLE = "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
-"""Two frames: the player draws in the first one after a change."""
 
 
 @pytest.fixture(scope="module")
 def page_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_rollouts(tmp_path_factory.mktemp("page") / "play.html", made_players(), {"made": "by hand"})
-
-
-class Player:
-    """The opened page, in the words of a reader."""
-
-    def __init__(self, page: Any) -> None:
-        self.page = page
-
-    def __getitem__(self, name: str) -> Any:
-        return self.page.locator(f"#player-{name}")
-
-    def text(self, name: str) -> str:
-        return self[name].inner_text().replace("\u00a0", " ")
-
-    def at(self, seconds: float) -> None:
-        self["time"].fill(str(10 + 10 * seconds))
-        self.page.evaluate(SETTLE)
-
-    def choose(self, name: str, label: str | re.Pattern[str]) -> None:
-        if isinstance(label, re.Pattern):
-            label = next(text for text in self.options(name) if label.search(text))
-        self[name].select_option(index=self.options(name).index(label))
-        self.page.evaluate(SETTLE)
-
-    def click(self, name: str, **options: Any) -> None:
-        self[name].click(**options)
-        self.page.evaluate(SETTLE)
-
-    def options(self, name: str) -> list[str]:
-        return [text.replace("\u00a0", " ") for text in self[name].locator("option").all_inner_texts()]
-
-    def chosen(self, name: str) -> str:
-        return self[name].evaluate("select => select.selectedOptions[0].text.replaceAll('\\u00a0', ' ')")
-
-    def picture(self, name: str) -> str:
-        return self[name].evaluate("canvas => canvas.toDataURL()")
-
-    def count(self, name: str, color: list[int]) -> int:
-        return self.page.evaluate(COUNT, [name, color])
 
 
 @pytest.fixture
@@ -122,7 +70,7 @@ def test_every_control_has_a_name_that_a_screen_reader_can_tell(player: Player) 
 def test_play_advances_the_clock_and_pause_stops_it(player: Player) -> None:
     before = player.picture("roll")
     player["play"].click()
-    player.page.wait_for_function("() => parseFloat(document.getElementById('player-clock').value.slice(1)) > 0.3")
+    player.wait_past(0.3)
     assert player.text("play") == "pause" and player.picture("roll") != before
     player.click("play")
     stopped = player.text("clock")
@@ -166,7 +114,7 @@ def test_keys_play_and_step(player: Player) -> None:
     player.page.evaluate(SETTLE)
     assert player.text("clock") == "+0.0 s"
     player.page.keyboard.press("Space")
-    player.page.wait_for_function("() => parseFloat(document.getElementById('player-clock').value.slice(1)) > 0.1")
+    player.wait_past(0.1)
 
 
 # --- what is chosen -------------------------------------------------------------------------------------------------
@@ -341,7 +289,7 @@ def test_two_fingers_zoom_and_choose_nobody(open_player: Callable[..., Player]) 
 def test_a_tap_plays(open_player: Callable[..., Player]) -> None:
     player = open_player(viewport={"width": 390, "height": 844}, has_touch=True, device_scale_factor=2)
     player["play"].tap()
-    player.page.wait_for_function("() => parseFloat(document.getElementById('player-clock').value.slice(1)) > 0.2")
+    player.wait_past(0.2)
 
 
 if __name__ == "__main__":
