@@ -107,7 +107,7 @@ def align(
     if ranks.agree(kept is not None and path.is_file(), "finished =", folder):
         check_kept(snapshots, options.steps)
         check_written(path)
-        tell(method, (kept or {}).get(SATURATED), ranks)
+        tell(method, kept.get(SATURATED), ranks)
         return path
     seed_everything(seed)
     candidates = make_candidates(method.data, store, scenes, context, model.tokenizer.cpu(), seed, played, learnt)
