@@ -112,13 +112,13 @@ def align(
     seed_everything(seed)
     candidates = make_candidates(method.data, store, scenes, context, model.tokenizer.cpu(), seed, played, learnt)
     check_enough(candidates, options.pairs_per_scene)
+    model = model.to(device)
     looks: list[Look | ImitationLook] = []
     if ranks.main and watch is not None:
-        looks.append(Look(watch, context, model.to(device), options))
+        looks.append(Look(watch, context, model, options))
     if ranks.main and SIDES[method.data.kind] == "targets" and store.provenance.num_rollouts > 1:
-        own = method.data.rank_by, learnt
-        looks.append(ImitationLook(store, scenes, context, model.to(device), options, *own))
-    loss = ranks.wrap(make_loss(method.loss, model.to(device)))
+        looks.append(ImitationLook(store, scenes, context, model, options, method.data.rank_by, learnt))
+    loss = ranks.wrap(make_loss(method.loss, model))
     optimizer = make_optimizer(model, options.lr, options.weight_decay)
     schedule = make_schedule(optimizer, options.steps, options.warmup)
     order = ShuffledOrder(len(candidates), options.scenes_per_step, seed)

@@ -41,8 +41,9 @@ def _experiment(experiment: Experiment, evaluations: Evaluations) -> Iterator[st
     else:
         yield f"**All at {next(iter(compared))}**, the one decoding of this experiment:"
     yield comparison_table(experiment, experiment.own_best)
-    yield "**Safety**, with the difference from the reference; less is better:"
-    yield safety_table(experiment, experiment.own_best, evaluations)
+    if safety := safety_table(experiment, experiment.own_best, evaluations):
+        yield "**Safety**, with the difference from the reference; less is better:"
+        yield safety
     if told := ordering(experiment):
         yield f"Against {experiment.labels[experiment.versus]}, {told}."
     remarks = (
@@ -82,17 +83,22 @@ def comparison_table(experiment: Experiment, comparison: Comparison) -> str:
     return to_markdown(titles, [*rows, *_published(experiment, titles)])
 
 
-def safety_table(experiment: Experiment, comparison: Comparison, evaluations: Evaluations) -> str:
+def safety_table(experiment: Experiment, comparison: Comparison, evaluations: Evaluations) -> str | None:
     """Rates of every method, first those that neither the distance nor the metric sees (``docs/safety.md``).
 
     Args:
         experiment: that it is of.
         comparison: one of its two.
         evaluations: figures of every scene; without them the differences have no intervals and are left out.
+
+    Returns:
+        Markdown; None where no safety was measured.
     """
     records, base = comparison.records(), comparison.base()
     names = {key: name for group in groups_of(experiment).values() for key, name in group.items()}
     shown = measured(records, names)
+    if not shown:
+        return None
     rows = []
     for record in records:
         mine = comparison.of(record["method"], decoding_of(record))
