@@ -5,7 +5,7 @@ Counts are gathered while scenes are made and added up over shards, so describin
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,12 @@ BINS = {
 }
 """Histogram -> width of a bin, and the unit. Speeds are of valid states; the others of agents at the current step."""
 CLASSES = tuple(kind.name.lower() for kind in AgentKind)
+AGENT_COLUMNS = (
+    "agents at the current step", "in all", "in a scene", "speed, median / 95 %", "there for", "travel", "length"
+)  # fmt: skip
+"""Titles of :func:`agent_rows`; what has no other name is a median."""
+MAP_COLUMNS = ("map, in a scene", "polylines", "points")
+"""Titles of :func:`map_rows`."""
 
 
 class Card:
@@ -36,6 +42,8 @@ class Card:
         >>> card.add(straight_road(num_vehicles=3))
         >>> card.counts["scenes"], card.counts["agents"]
         ({'all': 1, 'with lights': 0}, {'vehicle': 3})
+        >>> card.quantile("duration vehicle")
+        '9-10'
     """
 
     def __init__(self, counts: Mapping[str, Mapping[str, int]] | None = None) -> None:
@@ -73,6 +81,17 @@ class Card:
             for row, count in rows.items():
                 self._count(table, row, count)
 
+    def remove(self, counts: Mapping[str, Mapping[str, int]]) -> None:
+        """Take away the counts of some of the scenes that were counted; what is left is as if they had never been."""
+        for table, rows in counts.items():
+            mine = self.counts[table]
+            for row, count in rows.items():
+                mine[row] -= count
+                if not mine[row] and table != "scenes":  # whose rows are there for any scene, also where they are 0
+                    del mine[row]
+            if not mine:
+                del self.counts[table]
+
     def histogram(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Left edges of the bins of a histogram, and the counts; empty where nothing was counted."""
         rows = self.counts.get(name, {})
@@ -82,6 +101,18 @@ class Card:
         for row, count in rows.items():
             counts[int(row)] = count
         return np.arange(len(counts)) * _width(name), counts
+
+    def quantile(self, name: str, share: float = 0.5) -> str:
+        """The bin of a histogram that holds a quantile (the median), as ``low-high``.
+
+        Args:
+            name: of a histogram in which something was counted.
+            share: of what was counted that lies below.
+        """
+        numbers, counts = zip(*sorted((int(row), count) for row, count in self.counts[name].items()), strict=True)
+        place = int(np.searchsorted(np.cumsum(counts), share * sum(counts)))
+        low, width = numbers[place] * _width(name), _width(name)
+        return f"{low:g}-{low + width:g}"
 
     def _add_map(self, scene: Scene) -> None:
         groups = {"lane": LANE_KINDS, "road edge": EDGE_KINDS}
@@ -104,10 +135,6 @@ class Card:
             self._count(table, str(number), count)
 
 
-def _width(name: str) -> float:
-    return next(width for bins, (width, _) in BINS.items() if name.startswith(bins))
-
-
 def card_text(
     card: Card, title: str, facts: Mapping[str, Any], skipped: Iterable[str], notes: Mapping[str, int]
 ) -> str:
@@ -120,56 +147,63 @@ def card_text(
         skipped: errors of the records that gave no scene.
         notes: what readers could not take over -> how often.
     """
-    scenes, states = card.counts["scenes"], card.counts["states"]
-    every = scenes["all"]
-    facts = {
-        **facts,
-        "scenes": every,
-        "scenes with traffic lights": f"{scenes['with lights']} ({scenes['with lights'] / every:.0%})",
-        "valid states": f"{states['valid'] / states['all']:.0%} of agents x {LOG_STEPS} steps",
-    }
-    lacks = [
-        f"{name.replace('_', ' ')} ({count} scenes)" for name, count in sorted(card.counts.get("lacks", {}).items())
-    ]
     lines = [f"# {title}", "", "![what the scenes hold](card.png)", "", "| | |", "|---|---|"]
-    lines += [f"| {name} | {value} |" for name, value in facts.items()]
-    lines += [f"| lacks | {', '.join(lacks) or 'nothing'} |", "", *_agent_table(card), "", *_map_table(card), ""]
+    lines += [f"| {name} | {value} |" for name, value in {**facts, **scene_facts(card)}.items()]
+    lines += ["", *_markdown(AGENT_COLUMNS, agent_rows(card)), "", *_markdown(MAP_COLUMNS, map_rows(card)), ""]
     lines += _listing("Left out or changed by the reader", [f"{note}: {count} times" for note, count in notes.items()])
     lines += _listing("Records that gave no scene", skipped)
     return "\n".join(lines).rstrip() + "\n"
 
 
-def _agent_table(card: Card) -> list[str]:
+def scene_facts(card: Card) -> dict[str, str]:
+    """What a card says of its scenes, by name.
+
+    Args:
+        card: of one scene or more.
+
+    Examples:
+        >>> from envs.sources.synthetic import straight_road
+        >>> card = Card()
+        >>> card.add(straight_road(2))
+        >>> scene_facts(card)["scenes with traffic lights"]
+        '0 (0%)'
+    """
+    scenes, states = card.counts["scenes"], card.counts["states"]
+    every, lacks = scenes["all"], sorted(card.counts.get("lacks", {}).items())
+    return {
+        "scenes": str(every),
+        "scenes with traffic lights": f"{scenes['with lights']} ({scenes['with lights'] / every:.0%})",
+        "valid states": f"{states['valid'] / states['all']:.0%} of agents x {LOG_STEPS} steps",
+        "lacks": ", ".join(f"{name.replace('_', ' ')} ({count} scenes)" for name, count in lacks) or "nothing",
+    }
+
+
+def agent_rows(card: Card) -> list[list[str]]:
     """One row for each class, of agents that are there at the current step."""
-    lines = [
-        "| agents at the current step | in all | in a scene | speed, median / 95 % | there for | travel | length |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    rows = []
     for name in CLASSES:
         count = card.counts.get("agents", {}).get(name)
         if count:
-            low, high = (_quantile(card, f"speed {name}", share) for share in (0.5, 0.95))
-            others = [
-                f"{_quantile(card, f'{what} {name}', 0.5)} {BINS[what][1]}" for what in ("duration", "travel", "length")
-            ]
+            low, high = (card.quantile(f"speed {name}", share) for share in (0.5, 0.95))
+            others = [f"{card.quantile(f'{what} {name}')} {BINS[what][1]}" for what in ("duration", "travel", "length")]
             per_scene = count / card.counts["scenes"]["all"]
-            lines.append(f"| {name} | {count} | {per_scene:.1f} | {low} / {high} m/s | {' | '.join(others)} |")
-    return lines
+            rows.append([name, str(count), f"{per_scene:.1f}", f"{low} / {high} m/s", *others])
+    return rows
 
 
-def _quantile(card: Card, name: str, share: float = 0.5) -> str:
-    """The bin that holds a quantile (the median), as ``low-high``."""
-    edges, counts = card.histogram(name)
-    place = int(np.searchsorted(np.cumsum(counts), share * counts.sum()))
-    return f"{edges[place]:g}-{edges[place] + _width(name):g}"
+def map_rows(card: Card) -> list[list[str]]:
+    """One row for each kind of polyline."""
+    every, points = card.counts["scenes"]["all"], card.counts.get("points", {})
+    polylines = sorted(card.counts.get("polylines", {}).items())
+    return [[name, f"{count / every:.1f}", f"{points[name] / every:.0f}"] for name, count in polylines]
 
 
-def _map_table(card: Card) -> list[str]:
-    every = card.counts["scenes"]["all"]
-    lines = ["| map, in a scene | polylines | points |", "|---|---|---|"]
-    for name, count in sorted(card.counts.get("polylines", {}).items()):
-        lines.append(f"| {name} | {count / every:.1f} | {card.counts['points'][name] / every:.0f} |")
-    return lines
+def _width(name: str) -> float:
+    return next(width for bins, (width, _) in BINS.items() if name.startswith(bins))
+
+
+def _markdown(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    return [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|", *(f"| {' | '.join(row)} |" for row in rows)]
 
 
 def _listing(title: str, rows: Iterable[str]) -> list[str]:

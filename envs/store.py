@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from envs.card import Card
 from envs.files import write_json
 from envs.scene import Lacks, Scene, SceneError
 from envs.shards import FORMAT_VERSION, SUFFIX, Shard, file_digest, read_versioned
@@ -261,6 +262,45 @@ class SceneStore:
         """The input (a file) that a scene came from, and its record there."""
         shard, row = self._find(index)
         return shard.record.units[row]
+
+    def origins(self) -> list[dict[str, Any]]:
+        """Where the scenes came from.
+
+        Returns:
+            For each folder that has some of them ``source``, ``split``, ``named`` (the inputs, as the user named them)
+            and ``scenes``, their number.
+        """
+        numbers, counts = np.unique(self._folder_of_rows, return_counts=True)
+        return [
+            {
+                "source": manifest.source,
+                "split": manifest.options.get("split", ""),
+                "named": list(manifest.named),
+                "scenes": count,
+            }
+            for manifest, count in zip([self.manifests[i] for i in numbers], counts.tolist(), strict=True)
+        ]
+
+    def card(self) -> Card:
+        """What the scenes hold, as counts.
+
+        Every shard was counted as a whole when it was written. Of one that is in the view in part, the scenes that are
+        in it or those that are not are read, whichever are fewer.
+        """
+        card, left_out = Card(), Card()
+        numbers = np.searchsorted(self._starts, self._rows, side="right") - 1
+        for number in np.unique(numbers).tolist():
+            shard, rows = self._shards[number], self._rows[numbers == number] - self._starts[number]
+            every = len(shard.record.scene_ids)
+            others = np.setdiff1d(np.arange(every), rows)
+            part, read = card, rows
+            if len(others) < len(rows) == every - len(others):  # no scene stands in the view twice
+                card.merge(shard.record.card)
+                part, read = left_out, others
+            for row in read.tolist():
+                part.add(shard.scene(row))
+        card.remove(left_out.counts)
+        return card
 
     def verify(self, tick: Callable[[], None] = lambda: None) -> None:
         """Compare every file with its checksum, unpack and validate every scene, of the whole store.

@@ -18,6 +18,7 @@ import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from envs.card import Card
 from envs.codec import decode, encode
 from envs.scene import Lights, MapKind, Scene, SceneError, SceneSource, collate
 from envs.shards import FORMAT_VERSION, Shard
@@ -155,6 +156,37 @@ def test_scenes_are_selected_by_what_they_hold(store: SceneStore) -> None:
     with pytest.raises(ValueError, match="nothing is called 'signals'; a recording may lack .*LIGHTS"):
         store.select(complete_in=["signals"])
     assert len(store.select(min_agents=9)) == 0
+
+
+@pytest.mark.parametrize("rows", [[], [0], [2, 0], [0, 1, 2], [0, 1, 3, 4], [5, 4, 3, 1], [3, 3, 3, 3]])
+def test_the_card_of_a_view_is_that_of_its_scenes_one_by_one(tmp_path: Path, write_store, rows: list[int]) -> None:
+    shards = [straight_road(3), red_light()], [two_cars_head_on(), *(straight_road(n, seed=n) for n in (1, 2, 4))]
+    view = SceneStore(write_store(tmp_path / "cards", *shards)).subset(rows)
+    one_by_one = Card()
+    for scene in view:
+        one_by_one.add(scene)
+    assert view.card().counts == one_by_one.counts
+
+
+def test_a_card_reads_the_fewer_scenes_of_a_shard(tmp_path: Path, write_store, monkeypatch) -> None:
+    read, scene = [], Shard.scene
+    monkeypatch.setattr(Shard, "scene", lambda shard, row: read.append(row) or scene(shard, row))
+    store = SceneStore(write_store(tmp_path / "cards", [straight_road(n, seed=n) for n in (1, 2, 3, 4)]))
+    for rows, expected in (([0, 1, 2, 3], []), ([0, 1, 3], [2]), ([3], [3]), ([2, 2, 2], [2, 2, 2])):
+        read.clear()
+        store.subset(rows).card()
+        assert read == expected
+
+
+def test_a_view_names_the_folders_that_its_scenes_came_from(tmp_path: Path, write_store) -> None:
+    roads = write_store(tmp_path / "a", [straight_road(2), straight_road(5)], source="womd", split="training")
+    lights = write_store(tmp_path / "b", [red_light()], source="sumo", split="test")
+    origins = SceneStore(roads, lights).origins()
+    assert [(each["source"], each["split"], each["scenes"]) for each in origins] == [
+        ("womd", "training", 2), ("sumo", "test", 1),
+    ]  # fmt: skip
+    assert SceneStore(roads, lights).subset([2]).origins() == origins[1:]
+    json.dumps(origins)
 
 
 def test_blocks_are_runs_of_scenes_of_one_file(store: SceneStore) -> None:
