@@ -165,14 +165,16 @@ def scene_facts(card: Card) -> dict[str, str]:
         >>> from envs.sources.synthetic import straight_road
         >>> card = Card()
         >>> card.add(straight_road(2))
-        >>> scene_facts(card)["scenes with traffic lights"]
-        '0 (0%)'
+        >>> scene_facts(card)["agents at the current step"]
+        '2 (2.0 in a scene)'
     """
     scenes, states = card.counts["scenes"], card.counts["states"]
-    every, lacks = scenes["all"], sorted(card.counts.get("lacks", {}).items())
+    every, agents = scenes["all"], sum(card.counts.get("agents", {}).values())
+    lacks = sorted(card.counts.get("lacks", {}).items())
     return {
         "scenes": str(every),
         "scenes with traffic lights": f"{scenes['with lights']} ({scenes['with lights'] / every:.0%})",
+        "agents at the current step": f"{agents} ({agents / every:.1f} in a scene)",
         "valid states": f"{states['valid'] / states['all']:.0%} of agents x {LOG_STEPS} steps",
         "lacks": ", ".join(f"{name.replace('_', ' ')} ({count} scenes)" for name, count in lacks) or "nothing",
     }

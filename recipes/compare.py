@@ -26,6 +26,7 @@ from envs.files import write_json
 from recipes.common.cli import CONFIG, recipe
 from recipes.common.provenance import provenance
 from recipes.common.scenes import open_splits
+from recipes.experiment.cards import write_scene_cards
 from recipes.experiment.check import check_experiment
 from recipes.experiment.jobs import (
     align_job,
@@ -50,11 +51,12 @@ def compare(cfg: DictConfig) -> dict[str, Any]:
     """Run every stage of an experiment that is not done yet; write what it found and the scenes to play.
 
     Raises:
-        ValueError: options that do not fit, before any work.
+        ValueError: options that do not fit, or other scenes than those of the folder, before any work.
     """
     check_experiment(cfg)
     splits, runs, made = open_splits(cfg.scenes), runs_of(cfg), provenance("compare", cfg.device)
     with alone_in(runs.root):
+        write_scene_cards(runs.scenes, splits)
         with Workers(cfg.workers, cfg.threads) as workers:
             stages = Stages(workers, runs.stages)
             train_policies(cfg, stages)

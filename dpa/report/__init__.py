@@ -7,6 +7,7 @@ knows a policy or an environment. A study is a folder RUNS::
     seed_<n>/<method>/           scalars of a training run, and the evaluations behind the rows
     seed_<n>/preferences_*/      ranked rollouts of the policies of a seed
     stages.json                  seconds and jobs of each stage
+    scenes.json                  what the scenes of each split hold: dpa.report.scenes.read_scene_cards
     players.json                 scenes and rollouts to play: dpa.report.player.pack_players
     validity/, sensitivity/, discriminator/    summary.json of a study of rankings
 

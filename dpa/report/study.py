@@ -10,6 +10,7 @@ from typing import Any
 from dpa.preferences import PreferenceStore
 from dpa.preferences.card import DataCard, data_card
 from dpa.report.experiment import Experiment, read_experiment, read_json
+from dpa.report.scenes import SceneCard, read_scene_cards
 
 STUDIES = ("validity", "sensitivity", "discriminator")
 """Folders of a study that a recipe of their own fills."""
@@ -27,6 +28,7 @@ class Study:
         stages: seconds of each job of each stage.
         players: packed scenes and rollouts, see :func:`dpa.report.player.pack_players`.
         summaries: ``summary.json`` of each of :data:`STUDIES`.
+        scenes: data card of the scenes of each split.
         cards: data card of each store of preferences, by its folder relative to the study's.
     """
 
@@ -35,6 +37,7 @@ class Study:
     stages: Mapping[str, Mapping[str, float]]
     players: Mapping[str, Any] | None
     summaries: Mapping[str, Mapping[str, Any]]
+    scenes: Mapping[str, SceneCard]
     cards: Mapping[str, DataCard]
 
     @property
@@ -64,13 +67,14 @@ def read_study(folder: str | Path) -> Study:
             f"{folder} holds no results: neither experiments/*.json nor {', '.join(STUDIES)} with a summary.json; run "
             f"python -m recipes.compare experiment={FIRST} output={folder} first."
         )
-    stages, players = folder / "stages.json", folder / "players.json"
+    stages, players, scenes = (folder / f"{name}.json" for name in ("stages", "players", "scenes"))
     return Study(
         folder=folder,
         experiments={path.stem: read_experiment(path) for path in paths},
         stages=_account(stages) if stages.is_file() else {},
         players=read_json(players) if players.is_file() else None,
         summaries=summaries,
+        scenes=read_scene_cards(scenes) if scenes.is_file() else {},
         cards=_cards(folder),
     )
 

@@ -79,6 +79,11 @@ class RunFolder:
         return self.root / "stages.json"
 
     @property
+    def scenes(self) -> Path:
+        """What the scenes of each split hold."""
+        return self.root / "scenes.json"
+
+    @property
     def players(self) -> Path:
         """Scenes and rollouts to play."""
         return self.root / "players.json"

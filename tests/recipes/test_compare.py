@@ -100,6 +100,13 @@ def test_the_page_shows_methods_and_scenes(finished: Path) -> None:
     assert (finished / "likely.png").stat().st_size > 10_000
 
 
+def test_the_page_has_a_data_card_of_every_split(finished: Path) -> None:
+    cards = json.loads((finished / "scenes.json").read_text())["splits"]
+    sizes = {name: card["counts"]["scenes"]["all"] for name, card in cards.items()}
+    assert sizes | {"source": "store"} == experiment(finished)["scenes"]
+    assert "what the scenes were converted from" in (finished / "index.html").read_text()
+
+
 @pytest.mark.parametrize("name", [name for name in known_experiments() if name != "methods"])
 def test_every_experiment_runs_in_the_folder_of_the_first(
     run: Callable, options: Callable, finished: Path, name: str

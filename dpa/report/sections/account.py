@@ -1,15 +1,19 @@
-"""What the numbers cost and what they were learnt from: hours of each stage, data cards of the preferences."""
+"""What the numbers cost and what they rest on: hours of each stage, data cards of the scenes and of the preferences."""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping
 
 from dpa.preferences.card import DataCard
 from dpa.report.charts import bars, drawn, lines
+from dpa.report.experiment import SPLITS
 from dpa.report.markup import Html, Section, element, folded, hint, joined, table
+from dpa.report.scenes import SceneCard
 from dpa.report.study import Study
 from dpa.report.table import MISSING, duration, number
+from envs.card import AGENT_COLUMNS, MAP_COLUMNS
 
 CARD: Mapping[str, Callable[[DataCard], str]] = {
     "scenes": lambda card: f"{card.scenes}",
@@ -30,8 +34,8 @@ MANY = 10
 
 def account_section(study: Study) -> Section | None:
     """Compute account and data cards; None where the study has neither."""
-    parts = [*_stages(study), *_cards(study.cards)]
-    return Section("account", "Compute and preference data", joined(parts)) if parts else None
+    parts = [*_stages(study), *_scenes(study.scenes), *_cards(study.cards)]
+    return Section("account", "Compute and data", joined(parts)) if parts else None
 
 
 def _stages(study: Study) -> list[Html]:
@@ -50,6 +54,44 @@ def _stages(study: Study) -> list[Html]:
     shown = table(["stage", "time", "jobs"], rows)
     note = hint("Time of one worker, each job as it was done first, all experiments together (stages.json).")
     return [element("div", drawn(chart), element("div", shown, note), class_="gallery")]
+
+
+def _scenes(cards: Mapping[str, SceneCard]) -> list[Html]:
+    """A row for each split, below it one for each class of agents in it; map and inputs on request."""
+    if not cards:
+        return []
+    facts = next(iter(cards.values())).facts
+    classes = {split: {name: count for name, count, *_ in card.agents} for split, card in cards.items()}
+    named = list(dict.fromkeys(name for found in classes.values() for name in found))
+    rows = [
+        [SPLITS[split], _sources(card), *card.facts.values(), *(classes[split].get(name, "0") for name in named)]
+        for split, card in cards.items()
+    ]
+    inputs = [
+        [SPLITS[split], each["source"], each["split"] or MISSING, str(each["scenes"]), ", ".join(each["named"])]
+        for split, card in cards.items()
+        for each in card.origins
+    ]
+    return [
+        element("h3", "Scenes"),
+        table(["split", "from", *facts, *named], rows),
+        table(["split", *AGENT_COLUMNS], _by_split(cards, "agents")),
+        hint("Of agents at the current step; speeds of all their valid states. A median is given as the bin it is in."),
+        folded("map", table(["split", *MAP_COLUMNS], _by_split(cards, "road"))),
+        folded("what the scenes were converted from", table(["split", "source", "part", "scenes", "inputs"], inputs)),
+    ]
+
+
+def _sources(card: SceneCard) -> str:
+    """Where scenes came from; how many from each where they are of several sources."""
+    scenes: Counter[str] = Counter()
+    for each in card.origins:
+        scenes[each["source"]] += each["scenes"]
+    return next(iter(scenes)) if len(scenes) == 1 else ", ".join(f"{name} ({many})" for name, many in scenes.items())
+
+
+def _by_split(cards: Mapping[str, SceneCard], part: str) -> list[list[str]]:
+    return [[SPLITS[split], *row] for split, card in cards.items() for row in getattr(card, part)]
 
 
 def _cards(cards: Mapping[str, DataCard]) -> list[Html]:

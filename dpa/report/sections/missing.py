@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Iterable
+from pathlib import Path
 
 from dpa.report.markup import Section, element
 from dpa.report.study import STUDIES, Study
@@ -36,12 +37,19 @@ def missing_section(study: Study, experiments: Iterable[str]) -> Section | None:
         for name in STUDIES
         if name not in study.summaries
     }
+    if study.main is not None and not study.scenes:
+        lacking["data cards of the scenes"] = _again(study.main.command, folder)
     if study.players is None:
         lacking["scenes to play"] = shlex.join(["python", "-m", "recipes.compare", *options, "pictures.scenes=3"])
     if not lacking:
         return None
     rows = [element("li", name, ": ", element("code", command)) for name, command in lacking.items()]
     return Section("missing", "Not here yet", element("ul", *rows))
+
+
+def _again(command: str, folder: Path) -> str:
+    """A command of recipes.compare that finds everything done in the folder as it is called now."""
+    return shlex.join([*(each for each in shlex.split(command) if not each.startswith("output=")), f"output={folder}"])
 
 
 def _options(study: Study) -> list[str]:

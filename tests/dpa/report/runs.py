@@ -15,7 +15,8 @@ from dpa.preferences.examples import example_groups, example_provenance
 from dpa.preferences.writer import PreferenceWriter
 from dpa.report.player import PlayerScene, pack_players
 from dpa.report.statistics import paired_bootstrap
-from envs.sources.synthetic import straight_road
+from envs.card import Card
+from envs.sources.synthetic import red_light, straight_road
 from recipes import discriminator as discriminator_recipe
 from recipes import sensitivity as sensitivity_recipe
 from recipes import validity as validity_recipe
@@ -61,6 +62,7 @@ def write_runs(folder: Path) -> Path:
     snapshots = ["reference", "dpa_omf@20", "dpa_omf@40", "dpa_omf"]
     write_experiment(folder, "steps", snapshots)
     write(folder / "stages.json", STAGES)
+    write(folder / "scenes.json", scenes())
     for seed in SEEDS[:2]:
         with PreferenceWriter(folder / f"seed_{seed}" / "preferences_train", example_provenance()) as writer:
             writer.append(example_groups(num_scenes=3))
@@ -265,6 +267,23 @@ def discriminator() -> dict[str, Any]:
     training = {"0": {"best": {"step": 4, "held_out_loss": 0.4, "held_out_auc": 0.91}, "curve": [], "scenes": 8}}
     found = discriminator_recipe.summary_json(spurious.summarise(policies), training)
     return found | {"made": made("discriminator", policies)}
+
+
+def scenes() -> dict[str, Any]:
+    """Cards of a few roads; only scenes to tune on have a light."""
+    made = {"train": [straight_road(2), straight_road(3)], "tune": [red_light()], "eval": [straight_road(1)]}
+    cards = {name: Card() for name in made}
+    for name, of_split in made.items():
+        for scene in of_split:
+            cards[name].add(scene)
+    origin = {"source": "made & up", "split": "<any>", "named": ["some/folder"]}
+    return {
+        "options": {"scenes": dict.fromkeys(made, "0123")},
+        "splits": {
+            name: {"counts": card.counts, "origins": [origin | {"scenes": len(made[name])}]}
+            for name, card in cards.items()
+        },
+    }
 
 
 def players() -> dict[str, Any]:

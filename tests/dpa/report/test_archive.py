@@ -44,7 +44,7 @@ def test_it_holds_the_values_behind_every_row_and_the_curves_and_neither_weights
     runs: Path, archive: Path
 ) -> None:
     names = set(zipfile.ZipFile(archive).namelist())
-    kept = {file.relative_to(runs).as_posix() for file in runs.rglob("*.csv")} | {"stages.json"}
+    kept = {file.relative_to(runs).as_posix() for file in runs.rglob("*.csv")} | {"stages.json", "scenes.json"}
     kept |= {file.relative_to(runs).as_posix() for file in runs.glob("seed_*/*/eval_*.json")}
     assert kept <= names
     unwanted = ("players.json", "wandb/", "checkpoints/", "preferences_", ".partial-", ".pt")

@@ -355,6 +355,71 @@ def test_stages_cards_and_the_way_to_make_it_again_are_there(page: Page) -> None
     assert table(page, "method", "optimiser steps")[0] == ["DPA-OMF", "60", "960", "reference"]
 
 
+def test_the_scenes_of_every_split_have_a_data_card(page: Page) -> None:
+    (head,) = (rows[0] for rows in page.tables if [*map(clean, rows[0][:2])] == ["split", "from"])
+    rows = [dict(zip(map(clean, head), row, strict=True)) for row in table(page, "split", "from")]
+    assert [row["split"] for row in rows] == ["training", "tuning", "evaluation"]
+    assert {row["from"] for row in rows} == {"made & up"}
+    assert [row["scenes"] for row in rows] == ["2", "1", "1"]
+    assert [row["scenes with traffic lights"] for row in rows] == ["0 (0%)", "1 (100%)", "0 (0%)"]
+    assert rows[0]["agents at the current step"] == "5 (2.5 in a scene)" and rows[0]["vehicle"] == "5"
+    assert rows[0]["valid states"] == "100% of agents x 91 steps"
+    classes = table(page, "split", "agents at the current step")
+    assert classes[0] == ["training", "vehicle", "5", "2.5", "10-11 / 10-11 m/s", "9-10 s", "90-100 m", "4.5-5 m"]
+    assert table(page, "split", "source")[2] == ["evaluation", "made & up", "<any>", "1", "some/folder"]
+    assert table(page, "split", "map, in a scene")[0][1] == "lane"
+
+
+def test_a_study_without_data_cards_of_its_scenes_says_how_to_get_them(copied: Path, tmp_path: Path) -> None:
+    (copied / "scenes.json").unlink()
+    change(copied, "methods", command="python -m recipes.compare experiment=methods 'seeds=[0,1,2]' output=elsewhere")
+    page = Page(report(copied, tmp_path / "out").read_text(encoding="utf-8"))
+    assert not [rows for rows in page.tables if rows[0][:2] == ["split", "from"]]
+    again = f"python -m recipes.compare experiment=methods 'seeds=[0,1,2]' output={copied}"
+    assert f"data cards of the scenes: {again}" in page.text.partition("Not here yet")[2]
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "told"),
+    [
+        (["splits"], [], "['splits'] is []"),
+        (["splits", "eval"], {"counts": {}}, "['splits']['eval'] is {'counts': {}}"),
+        (["splits", "eval", "counts", "scenes", "all"], 0.5, "['scenes']['all'] is 0.5"),
+        (["splits", "tune", "origins"], [{"source": "womd"}], "['origins'][0] is {'source': 'womd'}"),
+    ],
+)
+def test_data_cards_of_another_shape_are_told(copied: Path, path: list[str], value: Any, told: str) -> None:
+    content = read(copied, "scenes.json")
+    place = content
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = value
+    (copied / "scenes.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"scenes\.json is no account of what the scenes of a study hold") as error:
+        read_study(copied)
+    assert told in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "counts",
+    [
+        {},
+        {"scenes": {"all": 0, "with lights": 0}, "states": {"all": 0, "valid": 0}},
+        {"agents": {"vehicle": 3}, "speed vehicle": {}},
+        {"agents": {"vehicle": 3}, "speed vehicle": {"fast": 3}},
+        {"agents": {"vehicle": 3}, "speed vehicle": {"9" * 400: 3}},
+        {"polylines": {"lane": 3}, "points": {}},
+    ],
+)
+def test_counts_that_make_no_card_are_told(copied: Path, counts: dict[str, Any]) -> None:
+    content = read(copied, "scenes.json")
+    known = content["splits"]["eval"]["counts"]
+    content["splits"]["eval"]["counts"] = known | counts if counts else {}
+    (copied / "scenes.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"scenes\.json is no account of what the scenes of a study hold"):
+        read_study(copied)
+
+
 def test_methods_that_train_on_more_are_named(copied: Path, tmp_path: Path) -> None:
     budget = read(copied, "experiments/methods.json")["budget"]
     budget["dpa_adef"] |= {"steps": 120, "rollouts": 1920}
