@@ -60,11 +60,17 @@ def _scenes(cards: Mapping[str, SceneCard]) -> list[Html]:
     """A row for each split, below it one for each class of agents in it; map and inputs on request."""
     if not cards:
         return []
-    facts = next(iter(cards.values())).facts
+    *facts, last = next(iter(cards.values())).facts  # the longest cells come last: what recordings lack
     classes = {split: {name: count for name, count, *_ in card.agents} for split, card in cards.items()}
     named = list(dict.fromkeys(name for found in classes.values() for name in found))
     rows = [
-        [SPLITS[split], _sources(card), *card.facts.values(), *(classes[split].get(name, "0") for name in named)]
+        [
+            SPLITS[split],
+            _sources(card),
+            *(card.facts[name] for name in facts),
+            *(classes[split].get(name, "0") for name in named),
+            card.facts[last],
+        ]
         for split, card in cards.items()
     ]
     inputs = [
@@ -74,10 +80,10 @@ def _scenes(cards: Mapping[str, SceneCard]) -> list[Html]:
     ]
     return [
         element("h3", "Scenes"),
-        table(["split", "from", *facts, *named], rows),
-        table(["split", *AGENT_COLUMNS], _by_split(cards, "agents")),
-        hint("Of agents at the current step; speeds of all their valid states. A median is given as the bin it is in."),
-        folded("map", table(["split", *MAP_COLUMNS], _by_split(cards, "road"))),
+        table(["split", "from", *facts, *named, last], rows),
+        hint("By class; speeds are of all valid states. A median is given as the bin that it lies in."),
+        table(AGENT_COLUMNS, _by_split(cards, "agents")),
+        folded("map", table(MAP_COLUMNS, _by_split(cards, "road"))),
         folded("what the scenes were converted from", table(["split", "source", "part", "scenes", "inputs"], inputs)),
     ]
 
@@ -91,7 +97,7 @@ def _sources(card: SceneCard) -> str:
 
 
 def _by_split(cards: Mapping[str, SceneCard], part: str) -> list[list[str]]:
-    return [[SPLITS[split], *row] for split, card in cards.items() for row in getattr(card, part)]
+    return [[f"{SPLITS[split]}, {name}", *row] for split, card in cards.items() for name, *row in getattr(card, part)]
 
 
 def _cards(cards: Mapping[str, DataCard]) -> list[Html]:

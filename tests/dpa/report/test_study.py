@@ -364,10 +364,11 @@ def test_the_scenes_of_every_split_have_a_data_card(page: Page) -> None:
     assert [row["scenes with traffic lights"] for row in rows] == ["0 (0%)", "1 (100%)", "0 (0%)"]
     assert rows[0]["agents at the current step"] == "5 (2.5 in a scene)" and rows[0]["vehicle"] == "5"
     assert rows[0]["valid states"] == "100% of agents x 91 steps"
-    classes = table(page, "split", "agents at the current step")
-    assert classes[0] == ["training", "vehicle", "5", "2.5", "10-11 / 10-11 m/s", "9-10 s", "90-100 m", "4.5-5 m"]
+    assert list(rows[0])[-1] == "lacks"
+    classes = table(page, "agents at the current step", "in all")
+    assert classes[0] == ["training, vehicle", "5", "2.5", "10-11 / 10-11 m/s", "9-10 s", "90-100 m", "4.5-5 m"]
     assert table(page, "split", "source")[2] == ["evaluation", "made & up", "<any>", "1", "some/folder"]
-    assert table(page, "split", "map, in a scene")[0][1] == "lane"
+    assert table(page, "map, in a scene", "polylines")[0][0] == "training, lane"
 
 
 def test_a_study_without_data_cards_of_its_scenes_says_how_to_get_them(copied: Path, tmp_path: Path) -> None:
