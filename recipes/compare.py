@@ -20,7 +20,7 @@ import hydra
 from omegaconf import DictConfig
 
 from dpa.policy import Decoding
-from dpa.report.experiment import read_json
+from dpa.report.experiment import read_experiment, read_json
 from dpa.report.table import REFERENCE, print_table
 from envs.files import write_json
 from recipes.common.cli import CONFIG, recipe
@@ -63,10 +63,11 @@ def compare(cfg: DictConfig) -> dict[str, Any]:
             chosen = choose(cfg, stages)
             measure(cfg, stages, chosen)
         found = summarise_experiment(cfg, splits, chosen, stages.seconds) | made
-        write_json(runs.experiment(cfg.experiment.name), found)
-        log_experiment(cfg, found)
+        path, pictures = runs.experiment(cfg.experiment.name), {}
+        write_json(path, found)
         if cfg.pictures.scenes:
-            write_players(cfg, splits[cfg.experiment.split], chosen.best)
+            pictures["scenes/likely"] = write_players(cfg, splits[cfg.experiment.split], chosen.best)
+        log_experiment(cfg, read_experiment(path), pictures)
     return found
 
 

@@ -3,66 +3,94 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig
 
-from dpa.report.experiment import read_experiment
+from dpa.report.experiment import Comparison, Experiment
 from dpa.report.figures import plot_comparison
+from dpa.report.sections.likelihood import FIGURES
+from dpa.report.sections.safety import SEEN, UNSEEN
 from dpa.report.table import REFERENCE, cells, header, summarise
 from dpa.training.loggers import make_logger
-from recipes.alignment.likelihoods import PROBED
 from recipes.common.cli import plain
 from recipes.evaluate import SCENE_FIGURES
-from recipes.experiment.jobs import runs_of
+
+DECODING = {"top_p": "top-p", "temperature": "temperature"}
+SAFETY = {key: f"{title} ↓" for key, title in (UNSEEN | SEEN).items()}
+TUNING = {"realism": "realism ↑", "spread": "spread [m]"}
+"""Figures of the tuning grid: what decodings are chosen by, and how far apart the rollouts of a scene lie."""
+
+Cells = tuple[Sequence[str], Sequence[Sequence[Any]]]
+"""Titles and rows of a table."""
 
 
-def log_experiment(cfg: DictConfig, found: Mapping[str, Any]) -> Path:
-    """Log both comparisons of an experiment, and the picture of the differences.
+def log_experiment(cfg: DictConfig, experiment: Experiment, pictures: Mapping[str, Path]) -> Path:
+    """Log an experiment's tables, its numbers, the picture of its differences, and those that were drawn of it.
 
     Args:
         cfg: with the section ``logger``.
-        found: content of the experiment's JSON, which has been written.
+        experiment: to log.
+        pictures: files by the names that they have in the logs.
 
     Returns:
         The folder of the logs.
     """
-    path = runs_of(cfg).experiment(found["name"])
-    folder = path.with_suffix("")
-    logger = make_logger(cfg.logger.backend, folder, plain(cfg), name=found["name"], mode=cfg.logger.mode)
-    compared = {"common": found, "own_best": found["own_best"]}
+    folder = experiment.path.with_suffix("")
+    logger = make_logger(cfg.logger.backend, folder, plain(cfg), name=experiment.name, mode=cfg.logger.mode)
     try:
-        for name, each in compared.items():
-            records = summarise(each["rows"], each["paired"])
-            logger.table(f"{name}/methods", header(records), cells(records), 0)
-            first = {record["method"]: record for record in reversed(records)}  # the reference's other decodings follow
-            values = {
-                f"{name}/{key}/{method}": record[key] for method, record in first.items() for key in SCENE_FIGURES
-            }
-            for entry in each["paired"]:
-                if entry["method"] != REFERENCE:
-                    low, high = entry["ci95"]
-                    told = {"difference": entry["realism_difference"], "low": low, "high": high}
-                    values |= {f"{name}/realism_{end}/{entry['method']}": value for end, value in told.items()}
-            logger.log({key: value for key, value in values.items() if value is not None}, 0)
-        logger.log(_likelihoods(found), 0)
+        for name, (titles, rows) in _tables(experiment):
+            logger.table(name, titles, rows, 0)
+        logger.log({name: value for name, value in _numbers(experiment) if value is not None}, 0)
         with tempfile.TemporaryDirectory() as drawn:
-            picture = Path(drawn) / "differences.png"
-            plot_comparison(read_experiment(path), picture)
-            logger.picture("own_best/differences", picture, 0)
+            differences = Path(drawn) / "differences.png"
+            plot_comparison(experiment, differences)
+            for name, picture in {"own_best/differences": differences, **pictures}.items():
+                logger.picture(name, picture, 0)
     finally:
         logger.close()
     return folder
 
 
-def _likelihoods(found: Mapping[str, Any]) -> dict[str, float]:
-    """Pair accuracy, likelihoods, entropy and drift of each method, means over seeds."""
-    means = {}
-    for name in (*PROBED, "kl"):
-        for method in found["methods"]:
-            values = [entry[name] for entry in found["likelihood"] if entry["method"] == method]
-            if values and None not in values:
-                means[f"likelihood/{name}/{method}"] = sum(values) / len(values)
-    return means
+def _tables(experiment: Experiment) -> Iterator[tuple[str, Cells]]:
+    for name, compared in _compared(experiment).items():
+        records = compared.records()
+        yield f"{name}/methods", (header(records), cells(records))
+        yield f"{name}/safety", _measured(records, SAFETY)
+    if experiment.likelihood:
+        yield "likelihood/methods", _measured(summarise(experiment.likelihood), FIGURES)
+    yield "tuning/decodings", _measured(summarise(experiment.tuning), TUNING)
+
+
+def _measured(records: Sequence[Mapping[str, Any]], figures: Mapping[str, str]) -> Cells:
+    """Records of :func:`~dpa.report.table.summarise` as numbers: method, decoding, and the figures that some have."""
+    named = {**DECODING, **figures}
+    shown = {key: title for key, title in named.items() if any(record.get(key) is not None for record in records)}
+    rows = [[record["method"], *(_short(record[key]) for key in shown)] for record in records]
+    return ["method", *shown.values()], rows
+
+
+def _short(value: float | None) -> float | None:
+    """More digits than the page has, and few enough to read."""
+    return None if value is None else float(f"{value:.5g}")
+
+
+def _numbers(experiment: Experiment) -> Iterator[tuple[str, float | None]]:
+    """Figures of each method, differences with their intervals, and likelihoods, pair accuracy, entropy and drift."""
+    for name, compared in _compared(experiment).items():
+        first = {record["method"]: record for record in reversed(compared.records())}  # other decodings follow
+        for method, record in first.items():
+            yield from ((f"{name}/{key}/{method}", record[key]) for key in SCENE_FIGURES)
+        for entry in (*compared.paired, *compared.versus):
+            if entry["method"] != REFERENCE:
+                to = "" if entry["against"] == REFERENCE else f"_to_{entry['against']}"
+                told = zip(("difference", "low", "high"), (entry["realism_difference"], *entry["ci95"]), strict=True)
+                yield from ((f"{name}/realism_{end}{to}/{entry['method']}", value) for end, value in told)
+    for record in summarise(experiment.likelihood):
+        yield from ((f"likelihood/{key}/{record['method']}", record.get(key)) for key in FIGURES)
+
+
+def _compared(experiment: Experiment) -> dict[str, Comparison]:
+    return {"common": experiment.at_common, "own_best": experiment.own_best}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict
+from pathlib import Path
 
 from omegaconf import DictConfig
 
@@ -22,13 +23,16 @@ from recipes.experiment.summary import labels
 from recipes.play import roll_out
 
 
-def write_players(cfg: DictConfig, scenes: SceneStore, chosen: Mapping[str, Run]) -> None:
+def write_players(cfg: DictConfig, scenes: SceneStore, chosen: Mapping[str, Run]) -> Path:
     """Roll the policies of the first seed out in some scenes, each at its own best decoding, and keep what is shown.
 
     Args:
         cfg: of the experiment; ``pictures`` names the number of scenes, rollouts and those kept.
         scenes: of the reported split; neighbours may be of one place, so those shown lie evenly among them.
         chosen: what stands for each method.
+
+    Returns:
+        The picture of the most likely rollouts.
     """
     runs, seed, options = runs_of(cfg), cfg.seeds[0], cfg.pictures
     files = {method: runs.policy(seed, run.policy) for method, run in chosen.items()}
@@ -44,7 +48,7 @@ def write_players(cfg: DictConfig, scenes: SceneStore, chosen: Mapping[str, Run]
         "seed": seed,
     }
     if runs.likely.is_file() and runs.players.is_file() and read_json(runs.players).get("options") == decided_by:
-        return
+        return runs.likely
     players = roll_out(
         {named[method]: path for method, path in files.items()},
         scenes,
@@ -58,3 +62,4 @@ def write_players(cfg: DictConfig, scenes: SceneStore, chosen: Mapping[str, Run]
     )
     plot_likely(players, runs.likely)
     write_json(runs.players, pack_players(players) | {"options": decided_by})
+    return runs.likely

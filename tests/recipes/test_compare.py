@@ -81,6 +81,7 @@ def test_tables_and_picture_are_in_the_logs_of_the_experiment(finished: Path) ->
     rows = (folder / "tables/own_best/methods/0.csv").read_text().splitlines()
     assert rows[0].startswith("method,") and [row.split(",")[0] for row in rows[1:]] == ["reference", *METHODS]
     assert (folder / "pictures/own_best/differences/0.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "pictures/scenes/likely/0.png").read_bytes() == (finished / "likely.png").read_bytes()
     logged = float((folder / "scalars/common/realism/dpa_omf.csv").read_text().split(",")[1])
     (row,) = [row for row in experiment(finished)["rows"] if row["method"] == "dpa_omf"]
     assert logged == pytest.approx(row["realism"])

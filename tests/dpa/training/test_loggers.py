@@ -6,7 +6,6 @@ import csv
 import importlib.util
 import io
 import json
-import time
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ import torch
 from PIL import Image
 
 from dpa.training.loggers import make_logger, read_curve
+from tests.dpa.training.offline import wandb_history
 
 HEADER = ["method", "realism", "scenes"]
 ROWS = [["reference", 0.5625, 54], ["a|b, c", None, 7]]
@@ -250,38 +250,6 @@ def test_tensorboard_holds_every_table_and_picture_once(tmp_path: Path) -> None:
         width, height, content = make_ndarray(event.tensor_proto)
         assert (int(width), int(height)) == (6, 4)
         assert np.array_equal(decoded(content), PIXELS + event.step)
-
-
-def wandb_records(run: Path) -> list[Any]:
-    """Records of an offline run: its file is a header of 7 bytes, then blocks of checksummed pieces of records."""
-    from wandb.proto.wandb_internal_pb2 import Record
-
-    data, place, content, records = run.read_bytes(), 7, b"", []
-    while place + 7 <= len(data):
-        left = 32768 - place % 32768
-        if left < 7:
-            place += left
-            continue
-        length, kind = int.from_bytes(data[place + 4 : place + 6], "little"), data[place + 6]
-        content += data[place + 7 : place + 7 + length]
-        place += 7 + length
-        if kind in (1, 4):  # a whole record, or the last piece of one
-            records.append(Record.FromString(content))
-            content = b""
-    return records
-
-
-def wandb_history(run: Path) -> list[dict[str, Any]]:
-    """Rows that an offline run logged, once the process that writes them has closed it."""
-    deadline = time.monotonic() + 60
-    while not any(record.HasField("exit") for record in wandb_records(run)):
-        assert time.monotonic() < deadline, f"{run} was not closed"
-        time.sleep(0.1)
-    histories = [record.history for record in wandb_records(run) if record.HasField("history")]
-    return [
-        {"/".join(item.nested_key) or item.key: json.loads(item.value_json) for item in history.item}
-        for history in histories
-    ]
 
 
 def test_wandb_holds_the_numbers_the_cells_and_the_pixels(tmp_path: Path) -> None:
