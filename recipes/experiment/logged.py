@@ -12,14 +12,14 @@ from omegaconf import DictConfig
 from dpa.report.experiment import Comparison, Experiment
 from dpa.report.figures import plot_comparison
 from dpa.report.sections.likelihood import FIGURES
-from dpa.report.sections.safety import SEEN, UNSEEN
+from dpa.report.sections.safety import RELATED, SEEN, UNSEEN
 from dpa.report.table import REFERENCE, cells, header, summarise
 from dpa.training.loggers import make_logger
 from recipes.common.cli import plain
 from recipes.evaluate import SCENE_FIGURES
 
 DECODING = {"top_p": "top-p", "temperature": "temperature"}
-SAFETY = {key: f"{title} ↓" for key, title in (UNSEEN | SEEN).items()}
+SAFETY = {key: f"{title} ↓" for key, title in (UNSEEN | RELATED | SEEN).items()}
 TUNING = {"realism": "realism ↑", "spread": "spread [m]"}
 """Figures of the tuning grid: what decodings are chosen by, and how far apart the rollouts of a scene lie."""
 
