@@ -23,8 +23,6 @@ SMALL = [
 OF_THE_MACHINE = ("stages", "worker_seconds", "versions", "command", "config", "date", "revision", "machine")
 """What differs between two runs of the same options."""
 
-pytestmark = pytest.mark.slow
-
 
 def command(options: Callable, output: Path, *more: str, workers: int = 1) -> list[str]:
     return options("compare", *SMALL, f"workers={workers}", f"output={output}", *more)
@@ -108,6 +106,7 @@ def test_the_page_has_a_data_card_of_every_split(finished: Path) -> None:
     assert "what the scenes were converted from" in (finished / "index.html").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in known_experiments() if name != "methods"])
 def test_every_experiment_runs_in_the_folder_of_the_first(
     run: Callable, options: Callable, finished: Path, name: str
@@ -127,6 +126,7 @@ def test_every_experiment_runs_in_the_folder_of_the_first(
         assert all(Path(row["file"]).name.startswith("tune_") for row in found["rows"])
 
 
+@pytest.mark.slow
 def test_a_finished_comparison_does_nothing_again(run: Callable, options: Callable, finished: Path) -> None:
     policies = sorted(finished.rglob("*.pt"))
     before, account = experiment(finished), json.loads((finished / "stages.json").read_text())
@@ -139,6 +139,7 @@ def test_a_finished_comparison_does_nothing_again(run: Callable, options: Callab
     assert json.loads((finished / "stages.json").read_text()) == account
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("workers", "sign"),
     [
