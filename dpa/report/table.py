@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from rich.box import SIMPLE_HEAD
@@ -92,6 +92,16 @@ def summarise(rows: Sequence[Mapping[str, Any]], paired: Sequence[Mapping[str, A
         record = _owner(entry, records)
         record["realism_difference"], record["ci95"] = entry["realism_difference"], list(entry["ci95"])
     return records
+
+
+def measured(records: Sequence[Mapping[str, Any]], keys: Iterable[str]) -> list[str]:
+    """Those measures that some record has a value of.
+
+    Examples:
+        >>> measured([{"realism": 0.7, "min_ade": None}], ["realism", "min_ade", "spread"])
+        ['realism']
+    """
+    return [key for key in keys if any(record.get(key) is not None for record in records)]
 
 
 def header(records: Sequence[dict[str, Any]]) -> list[str]:

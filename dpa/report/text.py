@@ -9,9 +9,20 @@ from dpa.report.experiment import Comparison, Experiment, decoding_of
 from dpa.report.findings import budgets, chosen_on_the_same, headline, left_out, ordering, saturated
 from dpa.report.paired import paired_figure
 from dpa.report.sections.likelihood import DIGITS, FIGURES
-from dpa.report.sections.safety import groups_of, measured
+from dpa.report.sections.safety import groups_of
 from dpa.report.study import Evaluations, Study
-from dpa.report.table import COLUMNS, MISSING, cells, difference, duration, header, number, summarise, to_markdown
+from dpa.report.table import (
+    COLUMNS,
+    MISSING,
+    cells,
+    difference,
+    duration,
+    header,
+    measured,
+    number,
+    summarise,
+    to_markdown,
+)
 
 
 def study_text(study: Study) -> str:
@@ -129,7 +140,7 @@ def likelihood_table(experiment: Experiment) -> str:
         experiment: with rows of likelihood.
     """
     records = summarise(experiment.likelihood)
-    shown = [key for key in FIGURES if any(record.get(key) is not None for record in records)]
+    shown = measured(records, FIGURES)
     rows = [
         [experiment.labels[record["method"]], *(number(record[key], DIGITS.get(key, 3)) for key in shown)]
         for record in records

@@ -12,14 +12,14 @@ from omegaconf import DictConfig
 from dpa.report.experiment import Comparison, Experiment
 from dpa.report.figures import plot_comparison
 from dpa.report.sections.likelihood import FIGURES
-from dpa.report.sections.safety import RELATED, SEEN, UNSEEN
-from dpa.report.table import REFERENCE, cells, header, summarise
+from dpa.report.sections.safety import MEASURES
+from dpa.report.table import REFERENCE, cells, header, measured, summarise
 from dpa.training.loggers import make_logger
 from recipes.common.cli import plain
 from recipes.evaluate import SCENE_FIGURES
 
 DECODING = {"top_p": "top-p", "temperature": "temperature"}
-SAFETY = {key: f"{title} ↓" for key, title in (UNSEEN | RELATED | SEEN).items()}
+SAFETY = {key: f"{title} ↓" for key, title in MEASURES.items()}
 TUNING = {"realism": "realism ↑", "spread": "spread [m]"}
 """Figures of the tuning grid: what decodings are chosen by, and how far apart the rollouts of a scene lie."""
 
@@ -67,7 +67,7 @@ def _tables(experiment: Experiment) -> Iterator[tuple[str, Cells]]:
 def _measured(records: Sequence[Mapping[str, Any]], figures: Mapping[str, str]) -> Cells:
     """Records of :func:`~dpa.report.table.summarise` as numbers: method, decoding, and the figures that some have."""
     named = {**DECODING, **figures}
-    shown = {key: title for key, title in named.items() if any(record.get(key) is not None for record in records)}
+    shown = {key: named[key] for key in measured(records, named)}
     rows = [[record["method"], *(_short(record[key]) for key in shown)] for record in records]
     return ["method", *shown.values()], rows
 

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
 
 from dpa.report.experiment import Comparison, Experiment, decoding_of, in_words
 from dpa.report.markup import Html, element, hint, joined, table
 from dpa.report.paired import paired_figure, quiet_change
 from dpa.report.study import Evaluations
-from dpa.report.table import REFERENCE, number
+from dpa.report.table import REFERENCE, measured, number
 
 UNSEEN = {"wrong_way": "wrong way", "red_light": "red light"}
 RELATED = {"close_pass": "close pass", "harsh_jerk": "harsh jerk"}
 """Computed otherwise than the features of the distance, but relatives of its clearance and effort."""
 SEEN = {"collision_rate": "collision", "offroad_rate": "off-road"}
 """In the paper's features of the preference distance, and in the metric."""
+MEASURES = UNSEEN | RELATED | SEEN
 RED_LIGHTS = "2025"
 """The metrics of this year weigh driving through red lights (dpa/realism/config)."""
 
@@ -57,11 +57,6 @@ def groups_of(experiment: Experiment) -> dict[str, Mapping[str, str]]:
         f"Safety that the metric of {experiment.metric} sees, and the preference distance does not": weighed,
         "Safety that both the preference distance and the metric see": SEEN,
     }
-
-
-def measured(records: Sequence[Mapping[str, Any]], keys: Iterable[str]) -> list[str]:
-    """Those that some record has a value of."""
-    return [key for key in keys if any(record.get(key) is not None for record in records)]
 
 
 def _table(
