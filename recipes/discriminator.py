@@ -17,8 +17,6 @@ from typing import Any
 import hydra
 import torch
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
 from dpa.discriminator import Discriminator, mean_squared_jerk
@@ -39,7 +37,8 @@ from recipes.common.scenes import fingerprint, open_splits
 from recipes.studies.adversary import best_look, fit
 from recipes.studies.motions import MotionShelf, Sight, driven_log
 from recipes.studies.spurious import QUANTITIES, RANKINGS, summarise
-from recipes.studies.study import as_json, how_made, rolled_out, shown, study_policy
+from recipes.studies.study import as_json, how_made, rolled_out, study_policy
+from recipes.studies.tables import StudyTable, tell
 
 FIGURES = ("realism", "kinematic", "interactive", "map_based")
 RANDOM_GROUPS = 8
@@ -220,10 +219,12 @@ def main(cfg: DictConfig) -> None:
         )
         measured[name] = study_policy(cfg, scenes, path, measure, decided_by, name)
     found, folder = summarise(measured), Path(cfg.output)
-    plot_discriminator(found, folder / "discriminator.png")
+    picture = folder / "discriminator.png"
+    plot_discriminator(found, picture)
     made = how_made(cfg, "discriminator", scenes, measured)
     write_json(folder / "summary.json", summary_json(found, training) | {"made": made})
-    _print(found, training, len(scenes), cfg)
+    head = f"{len(scenes)} scenes, {len(training)} policies, {cfg.num_rollouts} rollouts"
+    tell(cfg, tables(found, training, head, cfg.metric), {"correlation/discriminator": picture})
     print(f"numbers of every scene, summary and figure: {folder}")
 
 
@@ -238,26 +239,47 @@ def summary_json(found: dict[str, Any], training: dict[str, dict]) -> dict[str, 
     }
 
 
-def _print(found: dict[str, Any], training: dict[str, dict], num_scenes: int, cfg: DictConfig) -> None:
-    head = f"{num_scenes} scenes, {len(training)} policies, {cfg.num_rollouts} rollouts: Spearman with the score of"
-    table = Table("within a scene", *RANKINGS, "random", "discriminator, jerk fixed", "distance fixed", title=head)
-    for quantity, title in QUANTITIES.items():
-        columns = [found["correlation"][quantity][name] for name in (*RANKINGS, "random")]
-        columns += [found["given"][quantity].get(fixed) for fixed in ("jerk", "distance")]
-        table.add_row(title, *map(shown, columns))
-    quarters = Table("ranking", "best quarter", "worst quarter", title=f"realism ({cfg.metric}) minus random groups")
-    for name in RANKINGS:
-        quarters.add_row(name, *(shown(found["realism"][name][end]["realism"]) for end in ("best", "worst")))
-    for name, value in found["minus"].items():
-        quarters.add_row(f"discriminator minus {name}", shown(value), "")
-    for each in (table, quarters):
-        Console(width=190).print(each)
-    for name, done in training.items():
-        step, loss, area = (done["best"][key] for key in ("step", "held_out_loss", "held_out_auc"))
-        print(f"{name}: held-out AUC {area:.3f}, loss {loss:.3f} after {step} steps")
-    print(f"rollouts that score below the log: {shown(found['auc']['discriminator'])}")
-    print(f"rollouts that are jerkier than the log: {shown(found['auc']['jerk'])}")
-    print(f"|Spearman with jerk| minus |Spearman with the distance|: {shown(found['jerk_minus_distance'])}")
+def tables(found: dict[str, Any], training: dict[str, dict], title: str, metric: str) -> list[StudyTable]:
+    """What was found, and how the training of each policy's discriminator went, row by row."""
+    correlation = {
+        title: [
+            *(found["correlation"][quantity][name] for name in (*RANKINGS, "random")),
+            *(found["given"][quantity].get(fixed) for fixed in ("jerk", "distance")),
+        ]
+        for quantity, title in QUANTITIES.items()
+    }
+    quarters = {name: [found["realism"][name][end]["realism"] for end in ("best", "worst")] for name in RANKINGS} | {
+        f"discriminator minus {name}": [value, None] for name, value in found["minus"].items()
+    }
+    log = {
+        "rollouts that score below the log": [found["auc"]["discriminator"]],
+        "rollouts that are jerkier than the log": [found["auc"]["jerk"]],
+        "|Spearman with jerk| minus |Spearman with the distance|": [found["jerk_minus_distance"]],
+    }
+    looks = {
+        name: [done["best"][key] for key in ("held_out_auc", "held_out_loss", "step")]
+        for name, done in training.items()
+    }
+    fixed = ("random", "discriminator, jerk fixed", "distance fixed")
+    return [
+        StudyTable(
+            "correlation", f"{title}: Spearman with the score of", ["within a scene", *RANKINGS, *fixed], correlation
+        ),
+        StudyTable(
+            "quarters",
+            f"realism ({metric}) minus that of random groups",
+            ["ranking", "best quarter", "worst quarter"],
+            quarters,
+        ),
+        StudyTable("log", "rollouts beside the log", ["", "mean"], log),
+        StudyTable(
+            "training",
+            "training scenes that were held out",
+            ["policy", "held-out AUC", "held-out loss", "steps"],
+            looks,
+            signed=False,
+        ),
+    ]
 
 
 if __name__ == "__main__":

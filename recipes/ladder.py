@@ -15,8 +15,6 @@ from typing import Any
 import hydra
 import torch
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
 from dpa.policy import ContextOptions, Decoding, MotionLM
@@ -33,6 +31,7 @@ from recipes.common.cli import CONFIG, build, finished, plain, recipe
 from recipes.common.models import build_policy, context_options, open_policy, policies_of, policy_config, weights_digest
 from recipes.common.rolled import rolled
 from recipes.common.scenes import fingerprint, open_splits
+from recipes.studies.tables import StudyTable, tell
 
 Rung = Callable[[Scene, int, torch.Generator], Tensor]
 """Scene, number of rollouts and generator -> ``[R, A, 80, 4]``."""
@@ -182,20 +181,29 @@ def years_of(cfg: DictConfig) -> list[str]:
     return [str(year) for year in cfg.years]
 
 
+def table(ladder: dict[str, dict], years: list[str]) -> StudyTable:
+    """Realism of each rung by every metric, and what the last one says besides."""
+    besides = {"min_ade": "minADE [m]", "collision_rate": "collision", "offroad_rate": "off-road"}
+    last = years[-1]
+    rows = {
+        name: [
+            *(summary([scores[year]["realism"]]) for year in years),
+            *(torch.tensor(scores[last][key]).mean().item() for key in besides),
+        ]
+        for name, scores in ladder.items()
+    }
+    scenes = len(next(iter(ladder.values()))[last]["realism"])
+    columns = ["rung", *(f"realism {year}" for year in years), *besides.values()]
+    return StudyTable("rungs", f"{scenes} scenes", columns, rows, signed=False)
+
+
 @hydra.main(**CONFIG, config_name="ladder")
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.ladder``."""
     scenes = open_splits(cfg.scenes)[cfg.split]
     ladder, years = climb(cfg, scenes), years_of(cfg)
-    table = Table("rung", *(f"realism {year} [95 %]" for year in years), "minADE", "collision", "off-road")
-    last = years[-1]
-    for name, scores in ladder.items():
-        means = [summary([scores[year]["realism"]]) for year in years]
-        cells = [f"{found.mean:.3f} [{found.low:.3f}, {found.high:.3f}]" for found in means]
-        rest = [torch.tensor(scores[last][key]).mean() for key in ("min_ade", "collision_rate", "offroad_rate")]
-        table.add_row(name, *cells, *(f"{value:.3f}" for value in rest))
-    Console(width=140).print(table)
+    tell(cfg, [table(ladder, years)], {})
     if cfg.json is not None:
         write_json(cfg.json, {"scenes": len(scenes), "years": years, "rungs": ladder})
 

@@ -18,8 +18,6 @@ import hydra
 import numpy as np
 import torch
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.table import Table
 
 from dpa.preferences import nearest_farthest
 from dpa.ranking import Distance
@@ -30,7 +28,8 @@ from envs.files import write_json
 from recipes.common.cli import CONFIG, recipe
 from recipes.common.rolled import Rolled
 from recipes.common.scenes import open_splits
-from recipes.studies.study import as_json, distances_of, how_made, over_scenes, shown, study
+from recipes.studies.study import as_json, distances_of, how_made, over_scenes, study
+from recipes.studies.tables import StudyTable, tell
 
 ADE = "ade"
 MARGINS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, np.inf)
@@ -196,29 +195,42 @@ def main(cfg: DictConfig) -> None:
     variants = Variants(measured, cfg.baseline)
     found, folder = summarise(variants), Path(cfg.output)
     agreement = {name: values["correlation"] for name, values in found["variants"].items()}
-    plot_sensitivity(agreement, list(found["margins"].items()), folder / "sensitivity.png")
+    picture = folder / "sensitivity.png"
+    plot_sensitivity(agreement, list(found["margins"].items()), picture)
     made = how_made(cfg, "sensitivity", scenes, measured)
     write_json(folder / "summary.json", as_json(found) | {"seconds": variants.seconds, "made": made})
-    _print(found, variants, len(scenes))
+    tell(cfg, tables(found, variants), {"variants/sensitivity": picture})
     print(f"numbers of every scene, summary and figure: {folder}")
 
 
-def _print(found: dict[str, Any], variants: Variants, num_scenes: int) -> None:
-    policies, _, rollouts = variants.base.shape
-    head = f"{num_scenes} scenes, {policies} policies, {rollouts} rollouts, against {variants.baseline!r}"
-    table = Table("ranking", "Spearman", "same nearest quarter", "pairs turned round", "s per scene", title=head)
-    table.add_row(variants.baseline, "1", "1", "0", f"{variants.seconds[variants.baseline]:.3f}")
-    for name, values in found["variants"].items():
-        seconds = variants.seconds.get(name)
-        cells = (shown(values[key]) for key in ("correlation", "overlap", "turned"))
-        table.add_row(name, *cells, "–" if seconds is None else f"{seconds:.3f}")
-    pairs = Table(
-        "rollouts", "margin of a pair over the scene's mean", "ADE orders alike", title="nearest and farthest quarter"
-    )
-    for size, values in found["rollouts"].items():
-        pairs.add_row(str(size), shown(values["margin"]), shown(values["ade_agrees"]))
-    for each in (table, pairs):
-        Console(width=140).print(each)
+def tables(found: dict[str, Any], variants: Variants) -> list[StudyTable]:
+    """What :func:`summarise` found, row by row; the distance itself comes first."""
+    policies, scenes, rollouts = variants.base.shape
+    columns = ("correlation", "overlap", "turned")
+    rows = {variants.baseline: [1.0, 1.0, 0.0, variants.seconds[variants.baseline]]} | {
+        name: [*(values[key] for key in columns), variants.seconds.get(name)]
+        for name, values in found["variants"].items()
+    }
+    head = f"{scenes} scenes, {policies} policies, {rollouts} rollouts, against {variants.baseline!r}"
+    titles = ["ranking", "Spearman", "same nearest quarter", "pairs turned round", "s per scene"]
+    pairs = {str(size): [values["margin"], values["ade_agrees"]] for size, values in found["rollouts"].items()}
+    return [
+        StudyTable("variants", head, titles, rows, signed=False),
+        StudyTable(
+            "margins",
+            "share of pairs in the same order, by the gap of their distances over the scene's mean",
+            ["ranking", *found["margins"]],
+            {name: [values[name] for values in found["margins"].values()] for name in variants.others()},
+            signed=False,
+        ),
+        StudyTable(
+            "pairs",
+            "nearest and farthest quarter",
+            ["rollouts", "margin of a pair over the scene's mean", "ADE orders alike"],
+            pairs,
+            signed=False,
+        ),
+    ]
 
 
 if __name__ == "__main__":

@@ -16,8 +16,6 @@ import hydra
 import numpy as np
 import torch
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
 from dpa.ranking import Distance
@@ -30,7 +28,8 @@ from envs.seeding import make_generator
 from recipes.common.cli import CONFIG, finite, recipe
 from recipes.common.rolled import Rolled
 from recipes.common.scenes import open_splits
-from recipes.studies.study import as_json, distances_of, how_made, over_scenes, shown, study
+from recipes.studies.study import as_json, distances_of, how_made, over_scenes, study
+from recipes.studies.tables import StudyTable, tell
 
 FIGURES = ("realism", "kinematic", "interactive", "map_based")
 RANDOM_GROUPS = 8
@@ -184,31 +183,37 @@ def main(cfg: DictConfig) -> None:
     )
     found, paired = summarise(measured), compare_with(measured, cfg.against)
     folder = Path(cfg.output)
-    plot_validity(found, folder / "validity.png")
+    picture = folder / "validity.png"
+    plot_validity(found, picture)
     made = how_made(cfg, "validity", scenes, measured)
     content = {"rankings": as_json(found), "minus": cfg.against, "differences": as_json(paired), "made": made}
     write_json(folder / "summary.json", content)
-    _print(found, paired, len(scenes), len(measured), cfg)
-    print(f"numbers of every scene, summary and figure: {folder}")
-
-
-def _print(
-    found: dict, paired: dict[str, dict[str, Interval]], num_scenes: int, num_policies: int, cfg: DictConfig
-) -> None:
-    titles = ("Spearman of distance and realism", "nearer half", "nearest window", "farthest window")
-    table = Table("ranking", *titles, title=f"{num_scenes} scenes, {num_policies} policies, {cfg.metric}")
-    for name, values in found.items():
-        columns = ("correlation", "near_half", "nearest", "farthest")
-        table.add_row(name, *(shown(values[column]) for column in columns))
-    pairs = Table("ranking", "nearest window", "farthest window", title=f"realism minus that of {cfg.against!r}")
-    for name, values in paired.items():
-        pairs.add_row(name, *map(shown, values.values()))
-    for each in (table, pairs):
-        Console(width=140).print(each)
+    head = f"{len(scenes)} scenes, {len(measured)} policies, {cfg.metric}"
+    tell(cfg, tables(found, paired, head, cfg.against), {"rankings/validity": picture})
     print(
         f"windows of {cfg.window} of {cfg.num_rollouts} rollouts; realism minus that of {RANDOM_GROUPS} random groups; "
         "95 % intervals"
     )
+    print(f"numbers of every scene, summary and figure: {folder}")
+
+
+def tables(
+    found: dict[str, dict[str, Any]], paired: dict[str, dict[str, Interval]], title: str, against: str
+) -> list[StudyTable]:
+    """What :func:`summarise` and :func:`compare_with` found, row by row."""
+    columns = ("correlation", "near_half", "nearest", "farthest")
+    titles = ["ranking", "Spearman of distance and realism", "nearer half", "nearest window", "farthest window"]
+    return [
+        StudyTable(
+            "rankings", title, titles, {name: [values[key] for key in columns] for name, values in found.items()}
+        ),
+        StudyTable(
+            "differences",
+            f"realism minus that of {against!r}",
+            ["ranking", "nearest window", "farthest window"],
+            {name: list(values.values()) for name, values in paired.items()},
+        ),
+    ]
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from dpa.training.distributed import started_ranks
+from dpa.training.loggers import check_backend
 from envs.allocator import keep_freed_memory
 from envs.options import differences
 from recipes.common.limits import check_added, check_limits
@@ -97,8 +98,11 @@ def check_resources(cfg: DictConfig) -> None:
     """Set torch's threads and the allocator, and refuse what is not there or in the way, before any work.
 
     Raises:
-        ValueError: no such device, or a result that cannot be written because a folder has its name.
+        ValueError: no such device or logger, or a result that cannot be written because a folder has its name.
+        ImportError: the logger's package is missing.
     """
+    if "logger" in cfg:
+        check_backend(cfg.logger.backend)
     if cfg.get("json") is not None and Path(cfg.json).is_dir():
         raise ValueError(f"json={cfg.json} is a folder; name a file.")
     if not re.fullmatch(r"cpu|cuda(:\d+)?", str(cfg.device)):

@@ -9,7 +9,6 @@ from dpa.ranking import PreferenceDistance
 from dpa.realism.config import RealismConfig
 from dpa.report.experiment import REPORTED
 from dpa.tokens import VerletTokenizer
-from dpa.training.loggers import check_backend
 from recipes.alignment.candidates import check_data
 from recipes.alignment.losses import check_fit, make_loss
 from recipes.common.cli import check_steps, told_of
@@ -35,7 +34,6 @@ def check_experiment(cfg: DictConfig) -> None:
     check_steps(cfg.pretraining, "pretraining")
     policy_config(cfg.model)
     RealismConfig.load(str(cfg.evaluation.metric))
-    check_backend(cfg.logger.backend)
     if not cfg.seeds or len(set(cfg.seeds)) < len(cfg.seeds):
         raise ValueError(f"seeds must be one or more, each once, got {list(cfg.seeds)}.")
     _check_decodings(cfg)

@@ -160,8 +160,3 @@ def as_json(content: Any) -> Any:
     if isinstance(content, dict):
         return {key: as_json(value) for key, value in content.items()}
     return None if content is None else [as_json(value) for value in content]
-
-
-def shown(value: Interval | None) -> str:
-    """Mean and interval in a cell of a table."""
-    return "–" if value is None else f"{value.mean:+.3f} [{value.low:+.3f}, {value.high:+.3f}]"

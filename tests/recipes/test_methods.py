@@ -74,7 +74,6 @@ def test_a_method_comes_after_those_that_it_starts_from_or_learns_from() -> None
         (("seeds=[0,0]",), r"seeds must be one or more, each once, got \[0, 0\]"),
         (("aligned_scenes=0",), "aligned_scenes must be 1 or more, got 0"),
         (("evaluation.metric=2031",), "2031"),
-        (("logger.backend=mlflow",), "got 'mlflow'"),
         (("experiment.headline=nobody",), "experiment.headline=nobody is no method of the experiment"),
         (("+methods.dpa_omf.loss.alphas=1",), "methods.dpa_omf: .*no option 'alphas'"),
         (("methods.dpa_omf.data.kind=sets",), "methods.dpa_omf: .* learns from pairs"),

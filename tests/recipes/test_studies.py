@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 from collections.abc import Callable
@@ -11,15 +12,22 @@ import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from PIL import Image
+from tensorboard.backend.event_processing.plugin_event_accumulator import EventAccumulator
 
 from dpa.realism import realism
 from dpa.realism.config import FOLDER
+from dpa.report.statistics import Interval
+from dpa.training.loggers import read_curve
 from recipes import validity
 from recipes.common.cli import CONFIG
 from recipes.common.models import build_policy, policy_config, write_policy
 from recipes.sensitivity import Variants
 from recipes.sensitivity import summarise as summarise_variants
+from recipes.studies.tables import StudyTable, tell
 from recipes.validity import compare_with, summarise, windows
+from tests.dpa.training.offline import wandb_history
 
 SMALL = ["num_rollouts=8", "memory=0.001"]
 
@@ -145,6 +153,7 @@ def test_a_finished_study_is_read_back_and_a_killed_one_goes_on(
     [
         ("validity", ["window=9"], "window must be 1 to num_rollouts"),
         ("validity", ["policies=[]"], "policies=.. names no policy"),
+        ("validity", ["logger.backend=mlflow"], "logger.backend must be csv, wandb or tensorboard, got 'mlflow'"),
         ("validity", ["+rankings.bad={method: teleport}"], "unknown transport method 'teleport'"),
         ("sensitivity", ["baseline=none"], "baseline must be one of the rankings paper"),
         ("sensitivity", ["num_rollouts=4"], "num_rollouts must be 8 or more, got 4"),
@@ -200,3 +209,50 @@ def test_sensitivity_ranks_the_same_rollouts_by_every_variant(
     (first, *_) = json.loads((tmp_path / "0.json").read_text())["per_scene"]
     assert {len(values) for values in first["distance"].values()} == {8}
     assert (tmp_path / "sensitivity.png").stat().st_size > 10_000
+    with (tmp_path / "tables/variants/table/0.csv").open() as file:
+        (logged,) = (row for row in csv.DictReader(file) if row["ranking"] == "2 Hz")
+    mean, low = (summary["variants"]["2 Hz"]["correlation"][key] for key in ("mean", "ci95"))
+    assert float(logged["Spearman"]) == mean and float(logged["Spearman low"]) == low[0]
+    assert read_curve(tmp_path, "variants/Spearman/2_Hz") == [(0, mean)]
+    assert (tmp_path / "pictures/variants/sensitivity/0.png").is_file()
+
+
+# --- tables ---------------------------------------------------------------------------------------------------------
+def found_table(signed: bool = True) -> StudyTable:
+    gain = Interval(0.0421, 0.03, 0.05, over="seeds and scenes", num_seeds=3, num_scenes=24)
+    rows = {"omf": [gain, 1.5], "runs/ref/policy.pt": [-0.01, None]}
+    return StudyTable("rankings", "24 scenes", ["ranking", "nearest window", "seconds"], rows, signed)
+
+
+def test_a_table_is_printed_with_intervals_and_kept_as_numbers() -> None:
+    assert found_table().printed() == [
+        ["omf", "+0.042 [+0.030, +0.050]", "+1.500"],
+        ["runs/ref/policy.pt", "-0.010", "–"],
+    ]
+    assert found_table(signed=False).printed()[0] == ["omf", "0.042 [0.030, 0.050]", "1.500"]
+    titles, rows = found_table().kept()
+    assert titles == ["ranking", "nearest window", "nearest window low", "nearest window high", "seconds"]
+    assert rows == [["omf", 0.0421, 0.03, 0.05, 1.5], ["runs/ref/policy.pt", -0.01, None, None, None]]
+
+
+@pytest.mark.parametrize("backend", ["csv", "tensorboard", "wandb"])
+def test_a_study_is_logged_alike_in_every_backend(tmp_path: Path, backend: str) -> None:
+    cfg = OmegaConf.create({"output": str(tmp_path / "study"), "logger": {"backend": backend, "mode": "offline"}})
+    Image.new("RGB", (6, 4), "white").save(tmp_path / "drawn.png")
+    tell(cfg, [found_table()], {"rankings/drawn": tmp_path / "drawn.png"})
+    numbers = {"omf": 0.0421, "runs_ref_policy.pt": -0.01}
+    folder = tmp_path / "study"
+    assert (folder / "tables/rankings/table/0.csv").read_text().startswith("ranking,nearest window,nearest window low")
+    for row, value in numbers.items():
+        assert read_curve(folder, f"rankings/nearest_window/{row}") == [(0, value)]
+    if backend == "tensorboard":
+        events = EventAccumulator(str(folder / "tensorboard"), size_guidance={"tensors": 0}).Reload()
+        assert {"rankings/drawn", "rankings/table/text_summary"} <= set(events.Tags()["tensors"])
+        for row, value in numbers.items():
+            (event,) = events.Tensors(f"rankings/nearest_window/{row}")
+            assert event.tensor_proto.float_val[0] == pytest.approx(value)
+    if backend == "wandb":
+        (run,) = folder.glob("wandb/offline-run-*/*.wandb")
+        shown = {key: value for row in wandb_history(run) for key, value in row.items()}
+        assert shown.keys() >= {"rankings/drawn/_type", "rankings/table/_type"}
+        assert [shown[f"rankings/nearest_window/{row}"] for row in numbers] == pytest.approx(list(numbers.values()))

@@ -1,0 +1,115 @@
+"""Tables of a study, told once: printed for who waits, and kept as numbers for who comes later."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from omegaconf import DictConfig
+from rich import table as rich_table
+from rich.console import Console
+
+from dpa.report.statistics import Interval
+from dpa.training.loggers import make_logger
+from recipes.common.cli import plain
+
+Cell = float | Interval | None
+"""A number, a mean with its interval, or None for what is not known."""
+
+
+@dataclass(frozen=True)
+class StudyTable:
+    """What a study found, row by row.
+
+    Attributes:
+        name: in the logs.
+        title: above the table.
+        columns: titles; the first is that of the rows' names.
+        rows: by name, a cell for each further column.
+        signed: cells are differences or correlations and are printed with their sign.
+
+    Examples:
+        >>> near = Interval(0.04, 0.03, 0.05, over="scenes", num_seeds=1, num_scenes=24)
+        >>> table = StudyTable("rankings", "24 scenes", ["ranking", "nearest"], {"omf": [near]})
+        >>> table.printed(), table.kept()[1]
+        ([['omf', '+0.040 [+0.030, +0.050]']], [['omf', 0.04, 0.03, 0.05]])
+        >>> dict(table.numbers())
+        {'rankings/nearest/omf': 0.04, 'rankings/nearest_low/omf': 0.03, 'rankings/nearest_high/omf': 0.05}
+    """
+
+    name: str
+    title: str
+    columns: Sequence[str]
+    rows: Mapping[str, Sequence[Cell]]
+    signed: bool = True
+
+    def printed(self) -> list[list[str]]:
+        """Cells as text, three digits."""
+        sign = "+" if self.signed else ""
+        return [[name, *(_text(cell, sign) for cell in cells)] for name, cells in self.rows.items()]
+
+    def kept(self) -> tuple[list[str], list[list[str | float | None]]]:
+        """Header and rows as numbers; where a column has intervals their ends are columns of their own."""
+        titles, rows = [self.columns[0]], [[name] for name in self.rows]
+        for title, column in zip(self.columns[1:], zip(*self.rows.values(), strict=True), strict=True):
+            wide = any(isinstance(cell, Interval) for cell in column)
+            titles += [title, f"{title} low", f"{title} high"] if wide else [title]
+            for row, cell in zip(rows, column, strict=True):
+                row += _ends(cell) if wide else [cell]
+        return titles, rows
+
+    def numbers(self) -> Iterator[tuple[str, float]]:
+        """Every number that is known, as ``("<table>/<column>/<row>", value)``, in names that all loggers take."""
+        titles, rows = self.kept()
+        for column, title in enumerate(titles[1:], 1):
+            for row in rows:
+                if row[column] is not None:
+                    yield f"{self.name}/{_as_name(title)}/{_as_name(row[0])}", row[column]
+
+
+def tell(cfg: DictConfig, tables: Sequence[StudyTable], pictures: Mapping[str, Path]) -> None:
+    """Print the tables of a finished study, and log them with their numbers and its pictures.
+
+    Args:
+        cfg: with ``logger`` and ``output``, the folder of the study; the logs lie there.
+        tables: of the study.
+        pictures: files by the names that they have in the logs.
+    """
+    folder = Path(cfg.output)
+    logger = make_logger(cfg.logger.backend, folder, plain(cfg), name=folder.name, mode=cfg.logger.mode)
+    try:
+        for table in tables:
+            _print(table)
+            logger.table(f"{table.name}/table", *table.kept(), 0)
+            logger.log(dict(table.numbers()), 0)
+        for name, picture in pictures.items():
+            logger.picture(name, picture, 0)
+    finally:
+        logger.close()
+
+
+def _print(table: StudyTable) -> None:
+    shown = rich_table.Table(*table.columns, title=table.title)
+    for row in table.printed():
+        shown.add_row(*row)
+    Console(width=190 if len(table.columns) > 5 else 140).print(shown)
+
+
+def _as_name(title: str) -> str:
+    return re.sub(r"[^-\w.]+", "_", title).strip("_")
+
+
+def _text(cell: Cell, sign: str) -> str:
+    if cell is None:
+        return "–"
+    numbers = (cell.mean, cell.low, cell.high) if isinstance(cell, Interval) else (cell,)
+    mean, *ends = (f"{number:{sign}.3f}" for number in numbers)
+    return f"{mean} [{', '.join(ends)}]" if ends else mean
+
+
+def _ends(cell: Cell) -> list[float | None]:
+    if isinstance(cell, Interval):
+        return [cell.mean, cell.low, cell.high]
+    return [cell, None, None]
