@@ -19,6 +19,7 @@ from omegaconf import DictConfig
 from dpa.losses import SaturationWatch
 from dpa.preferences import PreferenceStore
 from dpa.report.curves import read_curves
+from dpa.report.findings import SATURATED
 from dpa.training.batches import ShuffledOrder
 from dpa.training.distributed import ALONE, Ranks, join_ranks
 from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
@@ -39,8 +40,6 @@ from recipes.common.scenes import fingerprint, open_splits
 
 OBSERVING = ("checkpoint_interval", "max_rows", "snapshots", "watch_interval", "watch_scenes", "watch_pairs")
 """Options of the section ``alignment`` that change nothing about the policy."""
-SATURATED = "saturated"
-"""Entry of ``result.json`` that only a run with a saturated loss has: the warning."""
 
 
 def align(

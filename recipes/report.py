@@ -3,7 +3,7 @@
     python -m recipes.report RUNS OUT
 
 RUNS is the folder that recipes.compare fills (its output). OUT is the page: a .html file, or a folder for index.html.
-With a .png it is one picture, the differences of the first experiment; with a .md the tables of all experiments, for a
+With a .png it is one picture, the differences of one experiment; with a .md the tables of all experiments, for a
 document; with a .zip what the numbers rest on, to hand on: results of every scene, options and curves, without weights,
 scenes and rollouts. Unpacked it is a RUNS again. The numbers are those of the files in RUNS.
 """
@@ -27,27 +27,33 @@ KINDS = (".html", ".png", ".md", ".zip")
 """What a study is written as."""
 
 
-def report(runs: Path, out: Path) -> Path:
-    """Write the page of a study, the picture of its first experiment, its tables, or what they rest on.
+def report(runs: Path, out: Path, experiment: str | None = None) -> Path:
+    """Write the page of a study, the picture of an experiment, its tables, or what they rest on.
 
     Args:
         runs: folder of results.
         out: ``.html``, a folder for ``index.html``, ``.png``, ``.md``, or ``.zip``.
+        experiment: of the picture; by default the first that the page shows.
 
     Returns:
         The file that was written.
 
     Raises:
-        ValueError: no results in ``runs``, a file of it that cannot be read, or another ending; the message names it.
+        ValueError: no results in ``runs``, a file of it that cannot be read, another ending, an experiment that is not
+            there or with which nothing is drawn; the message names it.
     """
     study = read_study(runs)
     if out.suffix in (".png", ".md") and not study.experiments:
         raise ValueError(f"{runs} holds no experiments/*.json, and {out.name} would show nothing else; say page.html.")
     if out.suffix not in ("", *KINDS):
         raise ValueError(f"{out} must end in one of {', '.join(KINDS)}, or be a folder.")
+    if experiment is not None and out.suffix != ".png":
+        raise ValueError(f"--experiment={experiment} is for a picture.png; {out.name or out} shows all experiments.")
+    if experiment is not None and experiment not in study.experiments:
+        raise ValueError(f"{runs} has no experiment {experiment!r}; it has {', '.join(study.experiments)}.")
     out.parent.mkdir(parents=True, exist_ok=True)
     if out.suffix == ".png":
-        plot_comparison(next(iter(study.experiments.values())), out)
+        plot_comparison(study.experiments[experiment or next(iter(study.experiments))], out)
         return out
     if out.suffix == ".zip":
         return write_archive(out, runs)
@@ -71,6 +77,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "out", metavar="OUT", type=Path, help="page.html, a folder, picture.png, tables.md, or results.zip"
     )
+    parser.add_argument("--experiment", metavar="NAME", help="experiment of picture.png; by default the first")
     return parser
 
 
@@ -78,7 +85,7 @@ def main() -> None:
     """Entry point of ``python -m recipes.report``."""
     given = make_parser().parse_args()
     try:
-        print(report(given.runs, given.out))
+        print(report(given.runs, given.out, given.experiment))
     except (ValueError, OSError) as error:
         sys.exit(refused(error))
 

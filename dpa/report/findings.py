@@ -10,6 +10,8 @@ from dpa.report.experiment import Decoding, Experiment, decoding_of, in_words, r
 from dpa.report.statistics import SCENES
 from dpa.report.table import REFERENCE, signed
 
+SATURATED = "saturated"
+"""Entry of a run's ``result.json`` that only a run with a saturated loss has: the warning."""
 FEW_SEEDS = 5
 """With fewer training runs a bootstrap interval is too narrow; see :func:`dpa.report.statistics.paired_bootstrap`."""
 
@@ -134,7 +136,7 @@ def saturated(experiment: Experiment, folder: Path) -> str | None:
     told = []
     for method, runs in experiment.curves.items():
         results = [folder / run / "result.json" for run in runs.values()]
-        warned = sum("saturated" in read_json(result) for result in results if result.is_file())
+        warned = sum(SATURATED in read_json(result) for result in results if result.is_file())
         if warned:
             told.append(f"{experiment.labels[method]} ({warned} of {len(runs)} seeds)")
     if not told:

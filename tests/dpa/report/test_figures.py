@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,20 @@ def test_the_forest_draws_each_interval_and_greys_those_with_zero(runs: Path, tm
     assert len(set(bars.values())) == 3
     with Image.open(tmp_path / "c.png") as picture:
         assert picture.format == "PNG"
+
+
+def test_the_picture_is_of_the_experiment_that_is_named(runs: Path, tmp_path: Path, drawn: list[Any]) -> None:
+    mine = shutil.copytree(runs, tmp_path / "runs")
+    whole = json.loads((mine / "experiments" / "methods.json").read_text())
+    whole["own_best"]["paired"] = whole["own_best"]["paired"][:1]
+    (mine / "experiments" / "short.json").write_text(json.dumps(whole))
+    for name, bars in ((None, 3), ("methods", 3), ("short", 1)):
+        report(mine, tmp_path / "c.png", name)
+        assert sum(len(set(line.get_xdata())) == 2 for line in drawn[-1].axes[0].lines) == bars
+    with pytest.raises(ValueError, match=r"runs has no experiment 'mine'; it has methods, scaling, short, steps\."):
+        report(mine, tmp_path / "d.png", "mine")
+    with pytest.raises(ValueError, match=r"--experiment=short is for a picture.png; tables.md shows all experiments"):
+        report(mine, tmp_path / "tables.md", "short")
 
 
 def test_nothing_to_compare_is_refused(runs: Path, tmp_path: Path) -> None:
