@@ -9,7 +9,7 @@ import re
 import shlex
 import zipfile
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -23,11 +23,14 @@ from envs import keys
 from envs.convert.__main__ import make_parser as convert_parser
 from envs.sources import SOURCES
 from envs.sources.sumo import parse, units
+from recipes import validity
 from recipes.alignment.losses import LOSSES
 from recipes.benchmark.__main__ import make_parser as benchmark_parser
 from recipes.common.models import TOKENIZERS
 from recipes.plan import make_parser as plan_parser
 from recipes.report import make_parser as report_parser
+from recipes.studies import spurious
+from recipes.studies.study import as_json
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 CONFIG = REPOSITORY / "recipes" / "config"
@@ -288,6 +291,39 @@ def test_the_study_beside_the_results_has_the_options_that_its_command_gives(stu
         for name in ("methods", "experiment", "aligned_scenes", "drift_rollouts", "device", "threads"):
             assert made[name] == given[name], name
         assert [made["scenes"][split] for split in SPLITS] == [given["scenes"][split] for split in SPLITS]
+
+
+def in_a_cell(value: dict[str, Any], digits: int) -> str:
+    """Mean and interval of a summary as the page of results writes them."""
+    mean, low, high = (f"{number:+.{digits}f}".replace("-", "−") for number in (value["mean"], *value["ci95"]))
+    return f"{mean} [{low}, {high}]"
+
+
+@pytest.mark.parametrize("name", ["validity", "discriminator"])
+def test_the_tables_of_a_study_of_rankings_are_those_of_the_values_of_its_scenes(study: Study, name: str) -> None:
+    told = (REPOSITORY / "docs" / "results.md").read_text(encoding="utf-8")
+    summary, folder = study.summaries[name], study.folder / name
+    policies = {policy: folder / f"{policy.replace('/', '_')}.json" for policy in summary["made"]["policies"]}
+    measured = {policy: json.loads(path.read_text())["per_scene"] for policy, path in policies.items()}
+    assert len(measured) == 5
+    if name == "validity":
+        assert as_json(validity.summarise(measured)) == summary["rankings"]
+        for ranking in summary["rankings"].values():
+            digits = {"correlation": 2, "near_half": 2, "nearest": 3, "farthest": 3}
+            assert " | ".join(in_a_cell(ranking[key], number) for key, number in digits.items()) in told
+    else:
+        again = as_json(spurious.summarise(measured))
+        assert {key: summary[key] for key in again} == again
+        for ranking in spurious.RANKINGS:
+            ends = (summary["realism"][ranking][end]["realism"] for end in ("best", "worst"))
+            assert " | ".join(in_a_cell(end, 3) for end in ends) in told
+    (options,) = re.findall(rf"^ +python -m recipes\.{name} (.* output=runs/study/{name})$", told, re.MULTILINE)
+    with initialize_config_dir(str(CONFIG), version_base="1.3"):
+        given = OmegaConf.to_container(compose(name, shlex.split(options)), resolve=True)
+    made = summary["made"]["config"]
+    differing = {key for key in made if made[key] != given[key]}
+    assert differing <= {"scenes"}, "where scenes are kept"
+    assert [made["scenes"][split] for split in SPLITS] == [given["scenes"][split] for split in SPLITS]
 
 
 def test_a_reader_gets_the_intervals_of_a_study_from_the_values_of_its_scenes(study: Study) -> None:
