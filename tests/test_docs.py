@@ -27,6 +27,7 @@ from recipes import validity
 from recipes.alignment.losses import LOSSES
 from recipes.benchmark.__main__ import make_parser as benchmark_parser
 from recipes.common.models import TOKENIZERS
+from recipes.difference import make_parser as difference_parser
 from recipes.plan import make_parser as plan_parser
 from recipes.report import make_parser as report_parser
 from recipes.studies import spurious
@@ -133,7 +134,7 @@ def extra_configurations(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-PLAIN = ("recipes.benchmark", "recipes.plan", "recipes.report")
+PLAIN = ("recipes.benchmark", "recipes.difference", "recipes.plan", "recipes.report")
 """Recipes whose arguments are no options of a configuration."""
 BENCHMARKS = [command for command in COMMANDS if command.startswith("recipes.benchmark ")]
 
@@ -146,6 +147,11 @@ def test_a_benchmark_takes_the_options_that_a_command_gives(command: str) -> Non
 @pytest.mark.parametrize("command", [command for command in COMMANDS if command.startswith("recipes.plan ")])
 def test_a_plan_takes_the_options_that_a_command_gives(command: str) -> None:
     assert plan_parser().parse_args(shlex.split(command)[1:]).rollout.suffix == ".json"
+
+
+@pytest.mark.parametrize("command", [command for command in COMMANDS if command.startswith("recipes.difference ")])
+def test_a_difference_takes_the_arguments_that_a_command_gives(command: str) -> None:
+    assert difference_parser().parse_args(shlex.split(command)[1:]).method
 
 
 @pytest.mark.parametrize("command", [command for command in COMMANDS if command.startswith("recipes.report ")])

@@ -6,16 +6,17 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dpa.report.markup import Html, quiet
 from dpa.report.statistics import Interval, paired_bootstrap
 from dpa.report.study import Evaluations
 
 
-def paired_figure(
+def paired_values(
     mine: Sequence[Mapping[str, Any]], base: Sequence[Mapping[str, Any]], key: str, evaluations: Evaluations
-) -> Interval | None:
-    """A figure minus that of another method, paired by seed and scene.
+) -> NDArray | None:
+    """A figure of two methods, paired by seed and scene.
 
     Args:
         mine: rows of a method, one for each seed, with their ``file``.
@@ -24,8 +25,8 @@ def paired_figure(
         evaluations: figures of every scene.
 
     Returns:
-        Over the scenes where all rows have a value; None where a file or the figure is missing, the seeds are others,
-        or no scene is left.
+        ``[2, seeds, scenes]`` over the scenes where all rows have a value; None where a file or the figure is missing,
+        the seeds are others, or no scene is left.
     """
     by_seed = {row["seed"]: row for row in base}
     if not mine or any(row["seed"] not in by_seed for row in mine):
@@ -40,7 +41,15 @@ def paired_figure(
         return None
     both = np.array(values, dtype=float)
     both = both[:, :, ~np.isnan(both).any((0, 1))]
-    return None if both.shape[-1] == 0 else paired_bootstrap(both[0], both[1])
+    return both if both.shape[-1] else None
+
+
+def paired_figure(
+    mine: Sequence[Mapping[str, Any]], base: Sequence[Mapping[str, Any]], key: str, evaluations: Evaluations
+) -> Interval | None:
+    """A figure minus that of another method; arguments, and when it is None, as in :func:`paired_values`."""
+    both = paired_values(mine, base, key, evaluations)
+    return None if both is None else paired_bootstrap(both[0], both[1])
 
 
 def quiet_change(found: Interval | None, digits: int = 3) -> Html:

@@ -1,0 +1,90 @@
+"""Any two methods of an experiment, compared in every measure from the values of its scenes."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpa.report.experiment import read_experiment
+from dpa.report.statistics import paired_bootstrap
+from dpa.report.study import Evaluations
+from recipes import difference
+from recipes.difference import Difference, differences
+from tests.dpa.report.runs import BEST, COMMON, SEEDS, likelihoods, values, write_runs
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_runs(tmp_path_factory.mktemp("study"))
+
+
+def found(runs: Path, method: str, other: str, *at: tuple[float, float]) -> dict[str, Difference]:
+    experiment = read_experiment(runs / "experiments" / "methods.json")
+    return {each.measure: each for each in differences(experiment, method, other, Evaluations(runs), at)}
+
+
+def test_each_method_stands_at_its_own_best_decoding(runs: Path) -> None:
+    experiment = read_experiment(runs / "experiments" / "methods.json")
+    (entry,) = (entry for entry in experiment.own_best.paired if entry["method"] == "dpa_omf")
+    realism = found(runs, "dpa_omf", "reference")["realism"]
+    mine, base = (
+        np.array([values(name, seed, experiment.chosen[name])["realism"] for seed in SEEDS])
+        for name in ("dpa_omf", "reference")
+    )
+    assert realism.interval.mean == pytest.approx(entry["realism_difference"])
+    assert realism.interval == paired_bootstrap(mine, base)
+    assert (realism.mine, realism.other) == pytest.approx((mine.mean(), base.mean()))
+    assert realism.ahead == (mine.mean(1) > base.mean(1)).sum()
+
+
+def test_decodings_may_be_given_for_both_or_one_of_each(runs: Path) -> None:
+    def mean(seeds: range, *side: object) -> float:
+        return np.mean([values(side[0], seed, side[1])["realism"] for seed in seeds])
+
+    both = found(runs, "dpa_omf", "reference", COMMON)["realism"]
+    assert (both.mine, both.other) == pytest.approx((mean(SEEDS, "dpa_omf", COMMON), mean(SEEDS, "reference", COMMON)))
+    each = found(runs, "dpa_omf", "reference", BEST, COMMON)["realism"]
+    assert (each.mine, each.other) == pytest.approx((mean(SEEDS, "dpa_omf", BEST), mean(SEEDS, "reference", COMMON)))
+
+
+def test_likelihoods_are_compared_too_and_a_scene_that_one_run_has_no_value_of_counts_nowhere(runs: Path) -> None:
+    measures = found(runs, "dpa_omf", "dpa_adef")
+    gain = np.mean(likelihoods("dpa_omf")["nll_preferred"]) - np.mean(likelihoods("dpa_adef")["nll_preferred"])
+    assert measures["nll_preferred"].interval.mean == pytest.approx(gain)
+    assert measures["red_light"].interval.num_scenes == measures["realism"].interval.num_scenes - 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["methods", "nobody"], "methods has no method 'nobody'; it has reference, dpa_omf"),
+        (["method", "dpa_omf"], "has no experiment 'method'; it has methods, scaling, steps."),
+        (["methods", "dpa_omf", "--at", "0.5,1"], "dpa_omf was not evaluated at top-p 0.5, but at top-p"),
+        (["methods", "dpa_omf", "--at", "0.5"], "'0.5' is no TOP_P,TEMPERATURE; say for example 0.95,1"),
+        (
+            ["methods", "dpa_omf", "--at", "1,1", "1,1", "1,1"],
+            "--at takes one decoding for both, or one of each, got 3",
+        ),
+    ],
+)
+def test_what_is_not_there_is_one_clear_sentence(
+    runs: Path, arguments: list[str], message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["difference", str(runs), *arguments])
+    with pytest.raises(SystemExit) as stopped:
+        difference.main()
+    assert stopped.value.code == 2 and message in capsys.readouterr().err
+
+
+def test_the_table_tells_what_is_certain_from_what_is_not(
+    runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["difference", str(runs), "methods", "dpa_omf"])
+    difference.main()
+    told = capsys.readouterr().out
+    realism = found(runs, "dpa_omf", "reference")["realism"].interval
+    assert "dpa_omf minus reference" in told
+    assert f"{realism.mean:+.4f} [{realism.low:+.4f}, {realism.high:+.4f}]" in told
