@@ -144,9 +144,19 @@ def jobs_of(cfg: DictConfig, runs: Iterable[Run], split: str) -> list[tuple[int,
 
 
 def tuning_realism(cfg: DictConfig, run: Run) -> float:
-    """Sum over seeds of the mean realism on the tuning scenes."""
+    """Sum over seeds of the mean realism on the tuning scenes.
+
+    Raises:
+        ValueError: there is none.
+    """
     paths = [runs_of(cfg).evaluation(seed, run, "tune") for seed in cfg.seeds]
-    return sum(read_json(path)["mean"]["realism"] for path in paths)
+    found = [read_json(path)["mean"]["realism"] for path in paths]
+    if None in found:
+        raise ValueError(
+            f"{paths[found.index(None)]}: no tuning scene has realism, so that no decoding can be chosen; name other "
+            "scenes.tune, of whose agents all features of the metric are scored."
+        )
+    return sum(found)
 
 
 @hydra.main(**CONFIG, config_name="compare")

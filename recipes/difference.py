@@ -48,7 +48,7 @@ class Difference(NamedTuple):
 def differences(
     experiment: Experiment, method: str, other: str, evaluations: Evaluations, at: Sequence[Decoding] = ()
 ) -> Iterator[Difference]:
-    """Every measure of an evaluation, and the likelihoods, of one method minus another.
+    """Every measure of an evaluation, and the likelihoods of the same policies, of one method minus another.
 
     Args:
         experiment: that has both.
@@ -58,11 +58,16 @@ def differences(
         at: decoding of both, or one of each; by default each at its own best.
 
     Raises:
-        ValueError: a method, or a decoding of it, that was not evaluated; the message names those that were.
+        ValueError: a method, or a decoding of it, that was not evaluated (the message names those that were), or a file
+            of values that is not there.
     """
     at = tuple(at) * (3 - len(at)) if at else (experiment.chosen.get(method), experiment.chosen.get(other))
     evaluated = [_rows(experiment, *side) for side in zip((method, other), at, strict=True)]
-    likely = [[row for row in experiment.likelihood if row["method"] == name] for name in (method, other)]
+    for rows in evaluated:
+        _check_files(rows, evaluations)
+    policies = {Path(row["file"]).parent for rows in evaluated for row in rows}  # a method may have several checkpoints
+    kept = [row for row in experiment.likelihood if Path(row["file"]).parent in policies]
+    likely = [[row for row in kept if row["method"] == name] for name in (method, other)]
     for mine, base in (evaluated, likely):
         measures = evaluations(mine[0]["file"]) if mine else None
         for measure in measures or ():
@@ -84,6 +89,14 @@ def _rows(experiment: Experiment, method: str, decoding: Decoding | None) -> Row
             f"{' '.join(f'{top_p:g},{temperature:g}' for top_p, temperature in known[:1])}."
         )
     return [found[seed] for seed in sorted(found)]
+
+
+def _check_files(rows: Rows, evaluations: Evaluations) -> None:
+    lost = next((row["file"] for row in rows if evaluations(row["file"]) is None), None)
+    if lost is not None:
+        raise ValueError(
+            f"{evaluations.folder / lost} is not there, and it holds the values of every scene; put it back."
+        )
 
 
 def decoding(text: str) -> Decoding:

@@ -19,7 +19,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from dpa.discriminator import Discriminator, mean_squared_jerk
+from dpa.discriminator import Discriminator, mean_squared_jerk, until_first_hole
 from dpa.policy import ContextOptions
 from dpa.ranking import Distance, occupancy_features
 from dpa.realism import RealismConfig, realism_of_groups
@@ -27,7 +27,6 @@ from dpa.report.studies import plot_discriminator
 from dpa.tokens import MotionTokenizer
 from dpa.training.checkpoint import load_policy, load_weights, save_policy
 from envs.files import write_json
-from envs.seeding import make_generator
 from envs.store import SceneStore
 from recipes.common.cli import CONFIG, build, finished, finite, plain, recipe
 from recipes.common.models import open_policy, policies_of, weights_digest
@@ -37,12 +36,10 @@ from recipes.common.scenes import fingerprint, open_splits
 from recipes.studies.adversary import best_look, fit
 from recipes.studies.motions import MotionShelf, Sight, driven_log
 from recipes.studies.spurious import QUANTITIES, RANKINGS, summarise
-from recipes.studies.study import as_json, how_made, rolled_out, study_policy
+from recipes.studies.study import RANDOM_GROUPS, as_json, how_made, random_groups, rolled_out, study_policy
 from recipes.studies.tables import StudyTable, tell
 
 FIGURES = ("realism", "kinematic", "interactive", "map_based")
-RANDOM_GROUPS = 8
-"""Groups of rollouts drawn at random from a scene: what a quarter scores that nothing has chosen."""
 SMALLEST = 8
 """Rollouts of a scene that have quarters worth looking at."""
 
@@ -76,7 +73,8 @@ def trained(cfg: DictConfig, scenes: SceneStore, policy: Path, name: str) -> tup
         net = Discriminator(**shape)
         load_weights(net, *load_policy(weights)[:2], shape, where=str(weights))
         return net.eval(), done
-    shelf = MotionShelf(folder / "motions", decided_by)
+    rolled_by = {key: decided_by[key] for key in ("policy", "scenes", "sight", "decoding", "seed")}
+    shelf = MotionShelf(folder / "motions", rolled_by | {"num_rollouts": cfg.training.num_rollouts})
     there = frozenset(shelf.scenes())
     see = partial(seen, sight=sight, tokenizer=copy.deepcopy(model.tokenizer).cpu(), options=context)
     for each in rolled_out(cfg, scenes, model, context, cfg.training.num_rollouts, there, f"{name} rollouts"):
@@ -119,12 +117,13 @@ def measure_scene(
         seed: of the random groups.
     """
     motions, log = seen(each, sight, tokenizer, options)
+    scene = until_first_hole(each.scene)  # past it the log that rollouts are compared with means nothing
     score, log_score = net.score(motions.rollouts, motions.valid), net.score(motions.log, motions.valid)
     ego = each.controlled.nonzero()[:, 0]
     both = torch.cat((log[None], each.trajectories))
     jerks = {
-        "jerk": mean_squared_jerk(each.scene, both, ego=ego),
-        "jerk_2hz": mean_squared_jerk(each.scene, both, ego=ego, stride=5),
+        "jerk": mean_squared_jerk(scene, both, ego=ego),
+        "jerk_2hz": mean_squared_jerk(scene, both, ego=ego, stride=5),
     }
     ranking = distance(each.scene, each.trajectories, each.controlled)
     quantity = {name: value[1:] for name, value in jerks.items()}
@@ -158,8 +157,7 @@ def realism_of_quarters(each: Rolled, scores: dict[str, Tensor], metric: Realism
         seed: of the random groups.
     """
     size = len(each.trajectories) // 4
-    draw = make_generator(seed, "discriminator", each.index)
-    groups = [torch.randperm(len(each.trajectories), generator=draw)[:size] for _ in range(RANDOM_GROUPS)]
+    groups = random_groups(each, size, seed, "discriminator")
     for score in scores.values():
         order = score.argsort(descending=True, stable=True)
         groups += [order[:size], order[-size:]]

@@ -13,12 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+import numpy as np
 import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
 from dpa.policy import ContextOptions, Decoding, MotionLM
-from dpa.realism import realism
+from dpa.realism import RealismConfig, realism
 from dpa.report.statistics import summary
 from dpa.rollout import lifted, make_collector
 from dpa.tokens import MotionTokenizer
@@ -27,7 +28,7 @@ from envs.files import write_json
 from envs.progress import progress
 from envs.scene import CURRENT_STEP, STEP_SECONDS, Scene, SceneSource
 from envs.seeding import make_generator
-from recipes.common.cli import CONFIG, build, finished, plain, recipe
+from recipes.common.cli import CONFIG, build, finished, finite, plain, recipe
 from recipes.common.models import build_policy, context_options, open_policy, policies_of, policy_config, weights_digest
 from recipes.common.rolled import rolled
 from recipes.common.scenes import fingerprint, open_splits
@@ -35,6 +36,8 @@ from recipes.studies.tables import StudyTable, tell
 
 Rung = Callable[[Scene, int, torch.Generator], Tensor]
 """Scene, number of rollouts and generator -> ``[R, A, 80, 4]``."""
+BESIDES = {"min_ade": "minADE [m]", "collision_rate": "collision", "offroad_rate": "off-road"}
+"""What is told beside realism."""
 NOISE_XY, NOISE_HEADING = 0.1, 0.01
 """Standard deviation of a noisy log's drift in one step [m], [rad]; it adds up to 0.9 m and 5 degrees at the end."""
 
@@ -103,14 +106,14 @@ def _recent(scene: Scene, steps: int) -> Tensor:
 
 
 def score_rung(scenes: SceneSource, rollouts: Iterator[tuple[int, Tensor]], years: list[str], name: str) -> dict:
-    """``{year: {figure: one value per scene}}`` of one rung."""
+    """``{year: {figure: one value per scene}}`` of one rung; None where a scene has none."""
     found: dict[int, dict[str, dict[str, float]]] = {}
     with progress(total=len(scenes), description=name, unit="scene") as bar:
         for index, poses in rollouts:
             found[index] = {year: realism(scenes[index], poses, year).as_dict() for year in years}
             bar.update()
-    figures = ("realism", "kinematic", "interactive", "map_based", "min_ade", "collision_rate", "offroad_rate")
-    return {year: {key: [found[i][year][key] for i in sorted(found)] for key in figures} for year in years}
+    figures = ("realism", "kinematic", "interactive", "map_based", *BESIDES)
+    return {year: {key: [finite(found[i][year][key]) for i in sorted(found)] for key in figures} for year in years}
 
 
 def crude(scenes: SceneSource, rung: Rung, num_rollouts: int, seed: int) -> Iterator[tuple[int, Tensor]]:
@@ -153,21 +156,27 @@ def rungs(cfg: DictConfig, scenes: SceneSource) -> Iterator[tuple[str, dict[str,
     for name, rung in made.items():
         yield name, {"tokenizer": plain(cfg.model.tokenizer)}, crude(scenes, rung, count, seed)
     decoding = {"decoding": plain(cfg.decoding)}
-    models = {"untrained model": (untrained, context_options(cfg.model))}
+    models = {"untrained model": (untrained, context_options(cfg.model), config)}
     for name, path in (policies_of(cfg) if cfg.policies else {}).items():
-        model, context, _ = open_policy(path, cfg.device)
-        models[name] = (model, context)
-    for name, (model, context) in models.items():
-        yield name, decoding | {"policy": weights_digest(model)}, driven(scenes, model, context, cfg)
+        models[name] = open_policy(path, cfg.device)
+    for name, (model, context, config) in models.items():
+        yield name, decoding | {"policy": weights_digest(model), **config}, driven(scenes, model, context, cfg)
 
 
 def climb(cfg: DictConfig, scenes: SceneSource) -> dict[str, dict]:
-    """Score every rung, or read it back; ``{rung: {year: {figure: one value per scene}}}``."""
-    common = {"scenes": fingerprint(scenes), "num_rollouts": cfg.num_rollouts, "seed": cfg.seed}
+    """Score every rung, or read it back; ``{rung: {year: {figure: one value per scene}}}``.
+
+    Raises:
+        ValueError: no metric is named, or a rung was scored with other options.
+    """
+    if not cfg.years:
+        raise ValueError('years is empty: there is no metric to score by; say years=["2024"].')
+    metrics = {year: RealismConfig.load(year).describe() for year in years_of(cfg)}
+    common = {"scenes": fingerprint(scenes), "num_rollouts": cfg.num_rollouts, "seed": cfg.seed, "years": metrics}
     ladder = {}
     for name, own, rollouts in rungs(cfg, scenes):
         path = Path(cfg.output) / f"{name.replace(' ', '_').replace('/', '_')}.json"
-        decided_by = common | own | {"years": years_of(cfg)}
+        decided_by = common | own
         done = finished(path, decided_by)
         if done is None:
             done = {"options": decided_by, "scores": score_rung(scenes, rollouts, years_of(cfg), name)}
@@ -182,19 +191,26 @@ def years_of(cfg: DictConfig) -> list[str]:
 
 
 def table(ladder: dict[str, dict], years: list[str]) -> StudyTable:
-    """Realism of each rung by every metric, and what the last one says besides."""
-    besides = {"min_ade": "minADE [m]", "collision_rate": "collision", "offroad_rate": "off-road"}
+    """Realism of each rung by every metric, and what the last one says besides, over the scenes that all rungs score.
+
+    Raises:
+        ValueError: there is none.
+    """
     last = years[-1]
-    rows = {
-        name: [
-            *(summary([scores[year]["realism"]]) for year in years),
-            *(torch.tensor(scores[last][key]).mean().item() for key in besides),
-        ]
+    values = {
+        name: np.array([scores[year]["realism"] for year in years] + [scores[last][key] for key in BESIDES], float)
         for name, scores in ladder.items()
     }
-    scenes = len(next(iter(ladder.values()))[last]["realism"])
-    columns = ["rung", *(f"realism {year}" for year in years), *besides.values()]
-    return StudyTable("rungs", f"{scenes} scenes", columns, rows, signed=False)
+    known = ~np.isnan(np.array(list(values.values()))).any((0, 1))
+    if not known.any():
+        raise ValueError("no scene has realism under every rung; choose scenes with vehicles.")
+    rows = {
+        name: [*(summary(row[None, known]) for row in found[: len(years)]), *found[len(years) :, known].mean(-1)]
+        for name, found in values.items()
+    }
+    columns = ["rung", *(f"realism {year}" for year in years), *BESIDES.values()]
+    left_out = f", {(~known).sum()} left out, which have no realism" if not known.all() else ""
+    return StudyTable("rungs", f"{known.sum()} scenes{left_out}", columns, rows, signed=False)
 
 
 @hydra.main(**CONFIG, config_name="ladder")

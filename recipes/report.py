@@ -42,24 +42,24 @@ def report(runs: Path, out: Path, experiment: str | None = None) -> Path:
         ValueError: no results in ``runs``, a file of it that cannot be read, another ending, an experiment that is not
             there or with which nothing is drawn; the message names it.
     """
-    study = read_study(runs)
-    if out.suffix in (".png", ".md") and not study.experiments:
+    study, kind = read_study(runs), "" if out.is_dir() else out.suffix
+    if kind in (".png", ".md") and not study.experiments:
         raise ValueError(f"{runs} holds no experiments/*.json, and {out.name} would show nothing else; say page.html.")
-    if out.suffix not in ("", *KINDS):
+    if kind not in ("", *KINDS):
         raise ValueError(f"{out} must end in one of {', '.join(KINDS)}, or be a folder.")
-    if experiment is not None and out.suffix != ".png":
+    if experiment is not None and kind != ".png":
         raise ValueError(f"--experiment={experiment} is for a picture.png; {out.name or out} shows all experiments.")
     if experiment is not None and experiment not in study.experiments:
         raise ValueError(f"{runs} has no experiment {experiment!r}; it has {', '.join(study.experiments)}.")
     out.parent.mkdir(parents=True, exist_ok=True)
-    if out.suffix == ".png":
+    if kind == ".png":
         plot_comparison(study.experiments[experiment or next(iter(study.experiments))], out)
         return out
-    if out.suffix == ".zip":
+    if kind == ".zip":
         return write_archive(out, runs)
-    if out.suffix == ".md":
+    if kind == ".md":
         return write_whole(out, study_text(study))
-    page = out if out.suffix == ".html" else out / "index.html"
+    page = out if kind == ".html" else out / "index.html"
     return write_study(page, study, experiments=known_experiments())
 
 

@@ -14,7 +14,6 @@ from typing import Any
 
 import hydra
 import numpy as np
-import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
@@ -24,16 +23,12 @@ from dpa.realism import RealismConfig, realism_of_groups
 from dpa.report.statistics import Interval, paired_bootstrap, summary
 from dpa.report.studies import plot_validity
 from envs.files import write_json
-from envs.seeding import make_generator
 from recipes.common.cli import CONFIG, finite, recipe
 from recipes.common.rolled import Rolled
 from recipes.common.scenes import open_splits
-from recipes.studies.study import as_json, distances_of, how_made, over_scenes, study
+from recipes.studies.study import RANDOM_GROUPS, as_json, distances_of, how_made, over_scenes, random_groups, study
 from recipes.studies.tables import StudyTable, tell
 
-FIGURES = ("realism", "kinematic", "interactive", "map_based")
-RANDOM_GROUPS = 8
-"""Groups of rollouts drawn at random from a scene: what a window scores that no distance has chosen."""
 ADE = "ade"
 
 
@@ -69,15 +64,13 @@ def measure_scene(
     rankings = {name: distance(each.scene, each.trajectories, each.controlled) for name, distance in distances.items()}
     values = {name: ranking.distance for name, ranking in rankings.items()}
     values[ADE] = next(iter(rankings.values())).ade
-    draw = make_generator(seed, "validity", each.index)
-    chosen = [torch.randperm(len(each.trajectories), generator=draw)[:window] for _ in range(RANDOM_GROUPS)]
-    groups = {name: windows(value, window, stride) for name, value in values.items()} | {"random": chosen}
+    groups = {name: windows(value, window, stride) for name, value in values.items()}
+    groups["random"] = random_groups(each, window, seed, "validity")
     flat = [group for each_group in groups.values() for group in each_group]
     scores = iter(realism_of_groups(each.scene, each.trajectories, flat, metric))
     found: dict[str, Any] = {}
     for name, members in groups.items():
-        results = [next(scores) for _ in members]
-        found[name] = {figure: [finite(getattr(result, figure)) for result in results] for figure in FIGURES}
+        found[name] = {"realism": [finite(next(scores).realism) for _ in members]}
         if name in values:
             found[name]["distance"] = [values[name][group].mean().item() for group in members]
     return found
@@ -157,10 +150,10 @@ def _with_realism(measured: dict[str, list[dict]]) -> list[list[dict]]:
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.validity``."""
-    if not 1 <= cfg.window <= cfg.num_rollouts or cfg.stride < 1:
+    if cfg.window < 1 or cfg.stride < 1 or cfg.window + cfg.stride > cfg.num_rollouts:
         raise ValueError(
-            f"window must be 1 to num_rollouts and stride 1 or more, got window={cfg.window}, stride={cfg.stride} and "
-            f"num_rollouts={cfg.num_rollouts}."
+            f"window and stride must be 1 or more and two windows must fit into num_rollouts, got window={cfg.window}, "
+            f"stride={cfg.stride} and num_rollouts={cfg.num_rollouts}; say num_rollouts={cfg.window + cfg.stride}."
         )
     distances = distances_of(cfg.rankings, "rankings")
     if not distances:

@@ -38,11 +38,14 @@ def mean_squared_jerk(scene: Scene, trajectories: Tensor, *, ego: Tensor | None 
         tensor([ 0.0, 33.1])
     """
     steps = trajectories.shape[2]
-    if not 1 <= stride <= steps:
-        raise ValueError(f"stride must be 1 to {steps}, the steps of the trajectories, got {stride}.")
+    if stride < 1 or _history(stride) + 1 + steps // stride <= DIFFERENCES:
+        raise ValueError(
+            f"stride must be 1 or more, and {DIFFERENCES + 1} poses of the log and of {steps} steps must lie so far "
+            f"apart, got {stride}."
+        )
     agents, present = scene.agents, scene.agents.present
     ego = torch.arange(trajectories.shape[1]) if ego is None else ego
-    history = min(DIFFERENCES - 1, CURRENT_STEP // stride)  # whole strides of the log before the current step
+    history = _history(stride)
     first = CURRENT_STEP - history * stride
     before = agents.position[present][ego, first : CURRENT_STEP + 1 : stride, :2].to(trajectories)
     after = trajectories[:, ego, stride - 1 :: stride, :2]
@@ -53,3 +56,8 @@ def mean_squared_jerk(scene: Scene, trajectories: Tensor, *, ego: Tensor | None 
     jerk = xy.double().diff(n=DIFFERENCES, dim=2) / (stride * STEP_SECONDS) ** DIFFERENCES
     squared = jerk.square().sum(-1) * counts
     return (squared.sum((1, 2)) / counts.sum().clamp(min=1)).to(trajectories.dtype)
+
+
+def _history(stride: int) -> int:
+    """Poses of the log that are taken before the current one, whole strides apart."""
+    return min(DIFFERENCES - 1, CURRENT_STEP // stride)

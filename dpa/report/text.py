@@ -123,9 +123,10 @@ def safety_table(experiment: Experiment, comparison: Comparison, evaluations: Ev
 
 
 def _published(experiment: Experiment, titles: Sequence[str]) -> Iterator[list[str]]:
-    """The paper's own numbers, in the columns that it has."""
+    """The paper's own numbers of the methods that ran, in the columns that it has."""
     columns = {f"{column.title} {column.better}": column for column in COLUMNS}
-    for method, figures in experiment.published.items():
+    told = {method: figures for method, figures in experiment.published.items() if method in experiment.labels}
+    for method, figures in told.items():
         cells = (
             number(figures.get(columns[title].key), columns[title].digits) if title in columns else MISSING
             for title in titles[1:]

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from envs.files import write_bytes
+from envs.options import differences
 
 
 class PartialResult:
     """JSON lines ``[scene index, entry]`` after a first line with the options; removed once the result is written.
 
-    Each is appended in one write. What a kill cut short is left out, and so is all that was scored
-    with other options.
+    Each is appended in one write. What a kill cut short is left out.
 
     Args:
         result: the JSON that the entries are for.
@@ -30,23 +30,30 @@ class PartialResult:
 
     def __init__(self, result: Path, decided_by: dict[str, Any]) -> None:
         self.path = result.with_name(f".{result.name}.scored")
-        self._options = json.dumps(decided_by, sort_keys=True) + "\n"
+        self._decided_by = decided_by
 
     def read(self) -> dict[int, dict[str, Any]]:
         """Entries of the scenes scored so far, by index; afterwards the file holds them and nothing else.
 
         Raises:
-            ValueError: the file is damaged.
+            ValueError: the file is damaged, or of other options.
         """
-        lines = self.path.read_text(encoding="utf-8").splitlines(keepends=True) if self.path.is_file() else []
-        same = lines[:1] == [self._options]
-        whole = [line for line in lines[1:] if line.endswith("\n")] if same else []
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(self.path, "".join([self._options, *whole]).encode())
+        text = self.path.read_text(encoding="utf-8") if self.path.is_file() else ""
+        lines = [line for line in text.splitlines(keepends=True) if line.endswith("\n")]
         try:
-            return {int(index): dict(entry) for index, entry in map(json.loads, whole)}
+            differ = differences(json.loads(lines[0]), self._decided_by) if lines else ""
+            found = {int(index): dict(entry) for index, entry in map(json.loads, lines[1:])}
         except (ValueError, TypeError) as error:
             raise ValueError(f"{self.path} is damaged ({error}); remove it and run again.") from None
+        if differ:
+            raise ValueError(
+                f"{self.path} holds scenes that were scored with other options ({differ}); name another output folder, "
+                "or remove it."
+            )
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        head = json.dumps(self._decided_by, sort_keys=True) + "\n"
+        write_bytes(self.path, "".join([head, *lines[1:]]).encode())
+        return found
 
     def add(self, entries: dict[int, dict[str, Any]]) -> None:
         """Append entries; :meth:`read` comes first."""

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
+
 from omegaconf import DictConfig, OmegaConf
 
 from dpa.policy import Decoding, MotionLM
 from dpa.ranking import PreferenceDistance
 from dpa.realism.config import RealismConfig
 from dpa.report.experiment import REPORTED
+from dpa.report.table import REFERENCE
 from dpa.tokens import VerletTokenizer
 from recipes.alignment.candidates import check_data
 from recipes.alignment.losses import check_fit, make_loss
@@ -16,6 +19,7 @@ from recipes.common.limits import check_limits
 from recipes.common.models import policy_config
 from recipes.common.rankings import build_distance, ranking_options
 from recipes.experiment.methods import read_setups
+from recipes.experiment.summary import labels
 
 CHECKPOINTS = ("last", "select", "all")
 """What becomes of the snapshots of an alignment: there are none, one of them may be chosen, or each is shown."""
@@ -77,8 +81,25 @@ def _check_methods(cfg: DictConfig) -> None:
         check_steps(setup.merged(cfg.alignment), f"alignment of {name}:")
 
 
+def _check_labels(cfg: DictConfig) -> None:
+    """Pictures and players know methods by their labels."""
+    called: dict[str, str] = {}
+    for method, label in labels(cfg, [REFERENCE, *cfg.methods]).items():
+        if label in called:
+            raise ValueError(
+                f"{called[label]} and {method} are both called {label!r}; say experiment.labels.{method}=NAME."
+            )
+        called[label] = method
+
+
 def _check_report(cfg: DictConfig) -> None:
     experiment = cfg.experiment
+    if not re.fullmatch(r"\w[\w.-]*", str(experiment.name)):
+        raise ValueError(
+            f"experiment.name={experiment.name!r} names a file and a place on the page; say it in letters, digits, _, "
+            "- and dots."
+        )
+    _check_labels(cfg)
     if experiment.headline not in cfg.methods:
         raise ValueError(
             f"experiment.headline={experiment.headline} is no method of the experiment; name one of "

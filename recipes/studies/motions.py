@@ -19,6 +19,7 @@ from dpa.ranking.features import feature_names
 from dpa.rollout import lifted
 from dpa.tokens import MotionTokenizer
 from envs.files import PARTIAL_PREFIX, whole, write_json
+from envs.options import differences
 from envs.scene import CURRENT_STEP, Scene
 from recipes.common.rolled import Rolled
 
@@ -110,11 +111,14 @@ def driven_log(scene: Scene, tokenizer: MotionTokenizer, options: ContextOptions
 class MotionShelf:
     """A folder with the motions of scenes, one file each, which appears whole or not at all.
 
-    Numbers are kept as float16: nobody sees a centimetre at 50 m. What was kept with other options is removed.
+    Numbers are kept as float16: nobody sees a centimetre at 50 m.
 
     Args:
         folder: made if it is not there.
         decided_by: all that decides the motions, ready for JSON.
+
+    Raises:
+        ValueError: the folder holds motions of other options, or its options are damaged.
 
     Examples:
         >>> import tempfile
@@ -129,9 +133,18 @@ class MotionShelf:
     def __init__(self, folder: str | Path, decided_by: dict[str, Any]) -> None:
         self.folder = Path(folder)
         self._options = self.folder / "options.json"
-        if not self._options.is_file() or json.loads(self._options.read_text(encoding="utf-8")) != decided_by:
+        if not self._options.is_file():
             self.remove()
             write_json(self._options, decided_by)
+            return
+        try:
+            differ = differences(json.loads(self._options.read_text(encoding="utf-8")), decided_by)
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{self._options} is damaged ({error}); remove {self.folder} and run again.") from None
+        if differ:
+            raise ValueError(
+                f"{self.folder} holds motions of other options ({differ}); name another output folder, or remove it."
+            )
 
     def scenes(self) -> list[int]:
         """Scenes that are there, in order."""

@@ -107,8 +107,8 @@ def summarise(measured: dict[str, list[dict]]) -> dict[str, Any]:
 
     Returns:
         ``auc`` of the discriminator and of either jerk alone (share of rollouts that have more of it than the log);
-        ``correlation`` of each ranking and of ``random`` scores with each quantity, ``minus_random`` of the
-        discriminator, and ``given`` (partial, with another quantity held fixed); ``jerk_minus_distance``: how much more
+        ``correlation`` of each ranking and of ``random`` scores with each quantity, and ``given`` (that of the
+        discriminator, with another quantity held fixed); ``jerk_minus_distance``: how much more
         strongly the discriminator goes with jerk than with the preference distance, absolute correlations of each
         scene; ``realism`` of the ``best`` and the ``worst`` quarter of each ranking minus that of random groups; and
         ``minus``, that of the discriminator's best quarter minus that of another ranking. An entry is None where no
@@ -118,11 +118,10 @@ def summarise(measured: dict[str, list[dict]]) -> dict[str, Any]:
         ValueError: no scene has realism, or the discriminator or the distance tells rollouts apart in none.
     """
     found = Ranked(measured)
-    correlation, minus_random, given = {}, {}, {}
+    correlation, given = {}, {}
     for quantity in QUANTITIES:
         each = {name: found.correlation(name, quantity) for name in RANKINGS} | {"random": found.random(quantity)}
         correlation[quantity] = {name: known(values) for name, values in each.items()}
-        minus_random[quantity] = known(each["discriminator"] - each["random"])
         given[quantity] = {
             fixed: known(found.given("discriminator", quantity, fixed)) for fixed in GIVEN if fixed != quantity
         }
@@ -133,7 +132,6 @@ def summarise(measured: dict[str, list[dict]]) -> dict[str, Any]:
     return {
         "auc": {"discriminator": summary(found.auc())} | {q: summary(found.auc_of(q)) for q in ("jerk", "jerk_2hz")},
         "correlation": correlation,
-        "minus_random": minus_random,
         "given": given,
         "jerk_minus_distance": over_scenes(jerk - distance, "discriminator"),
         "realism": {

@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from omegaconf import DictConfig
+from torch import Tensor
 
 from dpa.policy import ContextOptions, Decoding, MotionLM
 from dpa.ranking import Distance
@@ -15,6 +17,7 @@ from dpa.report.statistics import Interval, summary
 from dpa.rollout import make_collector
 from envs.files import write_json
 from envs.progress import progress
+from envs.seeding import make_generator
 from envs.store import SceneStore
 from recipes.common.cli import build, finished, plain
 from recipes.common.models import open_policy, policies_of, weights_digest
@@ -24,6 +27,10 @@ from recipes.common.rankings import build_distance
 from recipes.common.rolled import Rolled, rolled
 from recipes.common.scenes import fingerprint
 
+RANDOM_GROUPS = 8
+"""Groups of rollouts drawn at random from a scene: what they score, a group of that size scores that nothing chose."""
+TAKEN = ("ade", "random")
+"""Names of rankings that every study has."""
 Measure = Callable[[Rolled], dict[str, Any]]
 """Numbers of one scene from its rollouts, ready for JSON."""
 
@@ -116,9 +123,27 @@ def distances_of(section: DictConfig, name: str) -> dict[str, Distance]:
     """Distances by name, from a section of the configuration that holds the options of each.
 
     Raises:
-        ValueError: a wrong option; the message names it.
+        ValueError: a wrong option, or a name that studies have given already; the message names it.
     """
+    taken = next((key for key in section if key in TAKEN), None)
+    if taken is not None:
+        raise ValueError(
+            f"{name}.{taken}: {' and '.join(TAKEN)} stand for displacement and chance; choose another name."
+        )
     return {key: build_distance(options, f"{name}.{key}") for key, options in section.items()}
+
+
+def random_groups(each: Rolled, size: int, seed: int, study: str) -> list[Tensor]:
+    """Rollouts of a scene that nothing has chosen, :data:`RANDOM_GROUPS` times.
+
+    Args:
+        each: scene and rollouts.
+        size: rollouts of a group, each once.
+        seed: of the draw.
+        study: that draws; another one draws others.
+    """
+    draw = make_generator(seed, study, each.index)
+    return [torch.randperm(len(each.trajectories), generator=draw)[:size] for _ in range(RANDOM_GROUPS)]
 
 
 def how_made(cfg: DictConfig, recipe: str, scenes: SceneStore, measured: dict[str, list[dict]]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -55,6 +56,25 @@ def test_likelihoods_are_compared_too_and_a_scene_that_one_run_has_no_value_of_c
     gain = np.mean(likelihoods("dpa_omf")["nll_preferred"]) - np.mean(likelihoods("dpa_adef")["nll_preferred"])
     assert measures["nll_preferred"].interval.mean == pytest.approx(gain)
     assert measures["red_light"].interval.num_scenes == measures["realism"].interval.num_scenes - 1
+
+
+def test_a_file_that_is_lost_is_named(tmp_path: Path) -> None:
+    mine = write_runs(tmp_path)
+    experiment = read_experiment(mine / "experiments" / "methods.json")
+    lost = next(row["file"] for row in experiment.own_best.rows if row["method"] == "dpa_omf")
+    (mine / lost).unlink()
+    with pytest.raises(ValueError, match=f"{lost} is not there, and it holds the values of every scene"):
+        found(mine, "dpa_omf", "reference")
+
+
+def test_likelihoods_are_told_of_the_policies_that_were_evaluated_alone(tmp_path: Path) -> None:
+    mine = write_runs(tmp_path)
+    path = mine / "experiments" / "methods.json"
+    content = json.loads(path.read_text())
+    for row in content["likelihood"]:
+        row["file"] = row["file"].replace("/dpa_omf/", "/dpa_omf/step_30/")
+    path.write_text(json.dumps(content))
+    assert "realism" in found(mine, "dpa_omf", "reference") and "kl" not in found(mine, "dpa_omf", "reference")
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,9 @@ from torch import Tensor
 
 from dpa.discriminator import Discriminator, mean_squared_jerk
 from dpa.policy import ContextOptions
-from dpa.ranking import log_trajectory
+from dpa.ranking import PreferenceDistance, log_trajectory
 from dpa.ranking.agreement import rank_correlation
+from dpa.realism import RealismConfig
 from dpa.tokens import VerletTokenizer
 from dpa.training.checkpoint import load_policy
 from dpa.training.loggers import read_curve
@@ -145,15 +146,17 @@ def test_training_that_is_killed_goes_on_to_the_same_bits(
     assert read_curve(tmp_path / "killed", "train/loss") == read_curve(tmp_path / "whole", "train/loss")
 
 
-def test_a_shelf_of_other_options_is_emptied(tmp_path: Path) -> None:
+def test_a_shelf_of_other_options_is_told_and_kept(tmp_path: Path) -> None:
     seen = motions_of(*jittered(0))
     MotionShelf(tmp_path / "shelf", {"seed": 0}).put(4, seen)
     again = MotionShelf(tmp_path / "shelf", {"seed": 0})
     assert again.scenes() == [4]
     for mine, theirs in zip(again.get(4), seen, strict=True):
         assert torch.allclose(mine.float(), theirs.float(), atol=2e-2) and mine.shape == theirs.shape
-    assert MotionShelf(tmp_path / "shelf", {"seed": 1}).scenes() == []
-    MotionShelf(tmp_path / "shelf", {"seed": 1}).remove()
+    with pytest.raises(ValueError, match="shelf holds motions of other options .'seed': 0 there, 1 here"):
+        MotionShelf(tmp_path / "shelf", {"seed": 1})
+    assert again.scenes() == [4]
+    again.remove()
     assert not (tmp_path / "shelf").exists()
 
 
@@ -278,6 +281,23 @@ def test_scores_are_those_of_the_network_and_rates_those_of_the_events() -> None
     rates = discriminator.event_rates(each)
     assert rates["offroad"][:2].tolist() == pytest.approx([1 / 3, 0])
     assert rates["collision"][:3].tolist() == pytest.approx([0, 2 / 3, 0])
+
+
+def test_what_lies_behind_a_hole_of_the_log_has_no_jerk() -> None:
+    sight, found = Sight(), []
+    net = Discriminator(num_features=sight.width, width=4)
+    for last in (45, 91):  # a hole, or the end of the log
+        scene, poses = jittered(0)
+        scene.agents.valid[0, 40:last] = False
+        each = Rolled(0, scene, poses, torch.ones(3, dtype=torch.bool))
+        metric, distance = RealismConfig.load("2024"), PreferenceDistance()
+        found.append(
+            discriminator.measure_scene(each, net, sight, VerletTokenizer(), ContextOptions(), distance, metric, 0)
+        )
+    for jerk in ("jerk", "jerk_2hz"):
+        assert (
+            found[0]["log"][jerk] == found[1]["log"][jerk] and found[0]["quantity"][jerk] == found[1]["quantity"][jerk]
+        )
 
 
 @pytest.mark.parametrize(

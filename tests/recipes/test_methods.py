@@ -106,6 +106,11 @@ def test_a_method_comes_after_those_that_it_starts_from_or_learns_from() -> None
         ),
         (("collection.ranking.stride=0",), "collection.ranking.stride must be 1 or more, got 0"),
         (("evaluation.num_rollouts=0",), "evaluation.num_rollouts must be 1 or more, got 0"),
+        (("experiment.name=a/b",), "experiment.name='a/b' names a file and a place on the page"),
+        (
+            ("experiment.labels.dpa_adef=DPA-OMF",),
+            "dpa_omf and dpa_adef are both called 'DPA-OMF'; say experiment.labels.dpa_adef=NAME",
+        ),
         (("drift_rollouts=0",), "drift_rollouts must be 1 or more, got 0"),
         (("alignment.watch_interval=0",), "alignment.watch_interval must be 1 or more, got 0"),
         (("methods.dpa_omf.data.kind=pair",), r"methods\.dpa_omf: method\.data\.kind must be one of"),

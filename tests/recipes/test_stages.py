@@ -852,12 +852,13 @@ def test_a_metric_that_was_edited_is_another_one(run: Callable, options: Callabl
     assert outcome.status == 2 and "evaluation.json" in outcome.err
 
 
-def test_what_was_scored_with_other_options_does_not_count(tmp_path: Path) -> None:
+def test_what_was_scored_with_other_options_is_told_and_kept(tmp_path: Path) -> None:
     path = tmp_path / "result.json"
     PartialResult(path, {"seed": 0}).add({1: {"value": 0.5}})
     assert PartialResult(path, {"seed": 0}).read() == {1: {"value": 0.5}}
-    assert PartialResult(path, {"seed": 1}).read() == {}
-    assert PartialResult(path, {"seed": 0}).read() == {}, "it went with the run that replaced it"
+    with pytest.raises(ValueError, match="scored with other options .'seed': 0 there, 1 here"):
+        PartialResult(path, {"seed": 1}).read()
+    assert PartialResult(path, {"seed": 0}).read() == {1: {"value": 0.5}}
 
 
 def test_standing_agents_that_rollouts_move_are_counted() -> None:

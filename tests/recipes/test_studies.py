@@ -23,6 +23,7 @@ from dpa.training.loggers import read_curve
 from recipes import validity
 from recipes.common.cli import CONFIG
 from recipes.common.models import build_policy, policy_config, write_policy
+from recipes.ladder import BESIDES, table
 from recipes.sensitivity import Variants
 from recipes.sensitivity import summarise as summarise_variants
 from recipes.studies.tables import StudyTable, tell
@@ -151,8 +152,14 @@ def test_a_finished_study_is_read_back_and_a_killed_one_goes_on(
 @pytest.mark.parametrize(
     ("recipe", "more", "message"),
     [
-        ("validity", ["window=9"], "window must be 1 to num_rollouts"),
+        (
+            "validity",
+            ["window=9"],
+            "two windows must fit into num_rollouts, got window=9, stride=8 and num_rollouts=8; say num_rollouts=17",
+        ),
+        ("validity", ["window=8", "stride=1"], "two windows must fit .* say num_rollouts=9"),
         ("validity", ["policies=[]"], "policies=.. names no policy"),
+        ("validity", ["+rankings.ade={}"], "rankings.ade: ade and random stand for displacement and chance"),
         ("validity", ["logger.backend=mlflow"], "logger.backend must be csv, wandb or tensorboard, got 'mlflow'"),
         ("validity", ["+rankings.bad={method: teleport}"], "unknown transport method 'teleport'"),
         ("sensitivity", ["baseline=none"], "baseline must be one of the rankings paper"),
@@ -162,7 +169,7 @@ def test_a_finished_study_is_read_back_and_a_killed_one_goes_on(
 def test_a_wrong_option_is_told_before_any_work(
     run: Callable, options: Callable, policies: str, tmp_path: Path, recipe: str, more: list[str], message: str
 ) -> None:
-    window = ["window=4"] if recipe == "validity" and "window=9" not in more else []
+    window = ["window=4", "stride=2"] if recipe == "validity" and not more[0].startswith("window") else []
     outcome = run(recipe, *options(recipe, policies, *SMALL, *window, f"output={tmp_path / 'out'}", *more))
     assert outcome.status == 2
     assert re.search(message, outcome.err), outcome.err
@@ -215,6 +222,19 @@ def test_sensitivity_ranks_the_same_rollouts_by_every_variant(
     assert float(logged["Spearman"]) == mean and float(logged["Spearman low"]) == low[0]
     assert read_curve(tmp_path, "variants/Spearman/2_Hz") == [(0, mean)]
     assert (tmp_path / "pictures/variants/sensitivity/0.png").is_file()
+
+
+# --- ladder -----------------------------------------------------------------------------------------------------------
+def test_scenes_that_some_rung_has_no_realism_for_count_for_none() -> None:
+    def scores(*realism: float | None) -> dict:
+        return {"2024": {"realism": list(realism), **{name: [0.1, 0.2, 0.3] for name in BESIDES}}}
+
+    found = table({"log": scores(0.9, 0.7, 0.8), "noisy log": scores(0.5, None, 0.3)}, ["2024"])
+    assert found.title == "2 scenes, 1 left out, which have no realism"
+    assert found.rows["log"][0].mean == pytest.approx(0.85) and found.rows["noisy log"][0].mean == pytest.approx(0.4)
+    assert found.rows["log"][1:] == pytest.approx([0.2] * 3)
+    with pytest.raises(ValueError, match="no scene has realism under every rung"):
+        table({"log": scores(0.9, None, 0.8), "noisy log": scores(None, 0.5, None)}, ["2024"])
 
 
 # --- tables ---------------------------------------------------------------------------------------------------------

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 from dpa.report.markup import Section, element
 from dpa.report.study import STUDIES, Study
 
 OF_ONE = ("experiment", "method", "rankings", "pictures")
 """Options that belong to one experiment alone."""
+OF_ALL = "experiment.checkpoints="
+"""But not which checkpoints are kept: ``alignment.snapshots``, which experiments of a folder share, goes with it."""
 
 
 def missing_section(study: Study, experiments: Iterable[str]) -> Section | None:
@@ -55,11 +58,19 @@ def _again(command: str, folder: Path) -> str:
 def _options(study: Study) -> list[str]:
     """Options of the main experiment's command that another experiment in the same folder has to share."""
     given = shlex.split(study.main.command)[3:] if study.main is not None else []
-    kept = [each for each in given if not each.lstrip("+~").startswith(OF_ONE) and not each.startswith("output=")]
+    own = [each for each in given if each.lstrip("+~").startswith(OF_ONE) and not each.startswith(OF_ALL)]
+    kept = [each for each in given if each not in own and not each.startswith("output=")]
     return [*kept, f"output={study.folder}"]
 
 
 def _scenes(study: Study) -> list[str]:
-    """Options that name the scenes of the main experiment, whatever YAML they came from."""
-    given = study.main.config.get("scenes", {}) if study.main is not None else {}
-    return [f"scenes.{name}={json.dumps(given[name])}" for name in ("source", "train", "tune", "eval") if name in given]
+    """Options that give the scenes of the main experiment, whatever YAML they came from."""
+    return list(_settings("scenes", study.main.config.get("scenes", {}))) if study.main is not None else []
+
+
+def _settings(name: str, value: Any) -> Iterator[str]:
+    if isinstance(value, dict):
+        for key, each in value.items():
+            yield from _settings(f"{name}.{key}", each)
+    else:
+        yield f"{name}={json.dumps(value)}"

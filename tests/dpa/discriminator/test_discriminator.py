@@ -175,8 +175,14 @@ def test_only_logged_steps_of_the_agents_asked_for_count() -> None:
     found = mean_squared_jerk(scene, torch.cat((log, wild)), ego=torch.tensor([0]))
     assert found.abs().max() < 1e-2
     assert mean_squared_jerk(scene, wild)[0] > 100
-    with pytest.raises(ValueError, match="stride must be 1 to 80"):
-        mean_squared_jerk(scene, log, stride=0)
+
+
+@pytest.mark.parametrize("stride", [0, 27, 90])
+def test_a_stride_that_leaves_no_third_difference_is_refused(stride: int) -> None:
+    scene = straight_road(1)
+    with pytest.raises(ValueError, match=f"stride must be 1 or more, and 4 poses .* of 80 steps .*, got {stride}"):
+        mean_squared_jerk(scene, log_trajectory(scene, 80)[None], stride=stride)
+    assert mean_squared_jerk(scene, log_trajectory(scene, 80)[None], stride=26).isfinite().all()
 
 
 if __name__ == "__main__":

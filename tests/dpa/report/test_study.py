@@ -191,6 +191,17 @@ def change(runs: Path, name: str, **changes: Any) -> None:
     path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | changes), encoding="utf-8")
 
 
+def test_a_method_that_did_not_run_has_no_row_of_the_papers(copied: Path, tmp_path: Path) -> None:
+    change(copied, "methods", published={"dpa_omf": {"realism": 0.739}, "nobody": {"realism": 0.1234}})
+    told = report(copied, tmp_path / "tables.md").read_text(encoding="utf-8")
+    assert "*paper: DPA-OMF*" in told and "0.123" not in told
+
+
+def test_a_folder_with_a_dot_in_its_name_holds_a_page(copied: Path, tmp_path: Path) -> None:
+    (tmp_path / "v0.1").mkdir()
+    assert report(copied, tmp_path / "v0.1") == tmp_path / "v0.1" / "index.html"
+
+
 def test_safety_without_the_files_behind_it_has_no_intervals(copied: Path, tmp_path: Path) -> None:
     for file in copied.glob("seed_*/dpa_omf/eval_*.json"):
         file.unlink()
@@ -474,17 +485,24 @@ def test_what_is_missing_is_named_with_its_command(copied: Path, tmp_path: Path)
         shutil.rmtree(copied / name)
     (copied / "players.json").unlink()
     (copied / "experiments" / "steps.json").unlink()
-    given = "python -m recipes.compare scenes=made experiment=methods '~methods.cpl' 'seeds=[0,1,2]' output=elsewhere"
+    given = (
+        "python -m recipes.compare scenes=made experiment=methods experiment.checkpoints=last '~methods.cpl' "
+        "'seeds=[0,1,2]' output=elsewhere"
+    )
     scenes = {"source": "sumo", "train": "num_scenes=120,split=train", "tune": 16, "eval": "split=test", "limit": None}
+    scenes |= {"select": {"max_agents": 24, "complete_in": ["lights"]}, "shard_size": 256}
     change(copied, "methods", command=given, config={"scenes": scenes})
     study = read_study(copied)
     page = Page(write_study(tmp_path / "p.html", study, experiments=["methods", "steps"]).read_text(encoding="utf-8"))
     missing = page.text.partition("Not here yet")[2]
     for wanted in (
-        f"experiment steps: python -m recipes.compare experiment=steps scenes=made 'seeds=[0,1,2]' output={copied}",
+        "experiment steps: python -m recipes.compare experiment=steps scenes=made experiment.checkpoints=last "
+        f"'seeds=[0,1,2]' output={copied}",
         "validity: python -m recipes.validity 'scenes.source=\"sumo\"' 'scenes.train=\"num_scenes=120,split=train\"' "
-        "scenes.tune=16 'scenes.eval=\"split=test\"' 'policies=[POLICY.pt]'",
-        f"scenes to play: python -m recipes.compare scenes=made 'seeds=[0,1,2]' output={copied} pictures.scenes=3",
+        "scenes.tune=16 'scenes.eval=\"split=test\"' scenes.limit=null scenes.select.max_agents=24 "
+        "'scenes.select.complete_in=[\"lights\"]' scenes.shard_size=256 'policies=[POLICY.pt]'",
+        "scenes to play: python -m recipes.compare scenes=made experiment.checkpoints=last 'seeds=[0,1,2]' "
+        f"output={copied} pictures.scenes=3",
     ):
         assert wanted in missing
     assert "sensitivity: " not in missing and "experiment methods" not in missing
