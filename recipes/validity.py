@@ -41,6 +41,7 @@ def windows(distance: Tensor, size: int, stride: int) -> list[Tensor]:
         stride: from one window to the next.
 
     Examples:
+        >>> import torch
         >>> windows(torch.tensor([0.3, 0.1, 0.2, 0.4]), size=2, stride=2)
         [tensor([1, 2]), tensor([0, 3])]
     """
