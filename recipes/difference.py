@@ -61,8 +61,9 @@ def differences(
         ValueError: a method, or a decoding of it, that was not evaluated (the message names those that were), or a file
             of values that is not there.
     """
-    at = tuple(at) * (3 - len(at)) if at else (experiment.chosen.get(method), experiment.chosen.get(other))
-    evaluated = [_rows(experiment, *side) for side in zip((method, other), at, strict=True)]
+    own = (experiment.chosen.get(method), experiment.chosen.get(other))
+    decodings = {0: own, 1: (*at, *at), 2: at}[len(at)]
+    evaluated = [_rows(experiment, *side) for side in zip((method, other), decodings, strict=True)]
     for rows in evaluated:
         _check_files(rows, evaluations)
     policies = {Path(row["file"]).parent for rows in evaluated for row in rows}  # a method may have several checkpoints
@@ -140,6 +141,8 @@ def main() -> None:
             raise ValueError(f"--at takes one decoding for both, or one of each, got {len(given.at)}.")
         experiment = read_experiment(path)
         found = list(differences(experiment, given.method, given.other, Evaluations(given.runs), given.at))
+        if not found:
+            raise ValueError(f"{given.method} and {given.other} of {path} have no seed and scene in common.")
     except (ValueError, OSError) as error:
         sys.exit(refused(error))
     _print(found, given.method, given.other)

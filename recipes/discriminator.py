@@ -240,11 +240,11 @@ def summary_json(found: dict[str, Any], training: dict[str, dict]) -> dict[str, 
 def tables(found: dict[str, Any], training: dict[str, dict], title: str, metric: str) -> list[StudyTable]:
     """What was found, and how the training of each policy's discriminator went, row by row."""
     correlation = {
-        title: [
+        called: [
             *(found["correlation"][quantity][name] for name in (*RANKINGS, "random")),
             *(found["given"][quantity].get(fixed) for fixed in ("jerk", "distance")),
         ]
-        for quantity, title in QUANTITIES.items()
+        for quantity, called in QUANTITIES.items()
     }
     quarters = {name: [found["realism"][name][end]["realism"] for end in ("best", "worst")] for name in RANKINGS} | {
         f"discriminator minus {name}": [value, None] for name, value in found["minus"].items()
@@ -269,7 +269,7 @@ def tables(found: dict[str, Any], training: dict[str, dict], title: str, metric:
             ["ranking", "best quarter", "worst quarter"],
             quarters,
         ),
-        StudyTable("log", "rollouts beside the log", ["", "mean"], log),
+        StudyTable("log", "rollouts beside the log", ["of a scene", "mean"], log),
         StudyTable(
             "training",
             "training scenes that were held out",
