@@ -28,10 +28,9 @@ from envs.files import write_json
 from recipes.common.cli import CONFIG, recipe
 from recipes.common.rolled import Rolled
 from recipes.common.scenes import open_splits
-from recipes.studies.study import as_json, distances_of, how_made, over_scenes, study
+from recipes.studies.study import ADE, as_json, distances_of, how_made, over_scenes, study
 from recipes.studies.tables import StudyTable, tell
 
-ADE = "ade"
 MARGINS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, np.inf)
 """Bounds of the ranges of a pair's gap over the scene's mean distance."""
 SMALLEST_GROUP = 8

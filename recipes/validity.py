@@ -26,10 +26,8 @@ from envs.files import write_json
 from recipes.common.cli import CONFIG, finite, recipe
 from recipes.common.rolled import Rolled
 from recipes.common.scenes import open_splits
-from recipes.studies.study import RANDOM_GROUPS, as_json, distances_of, how_made, over_scenes, random_groups, study
+from recipes.studies.study import ADE, RANDOM_GROUPS, as_json, distances_of, how_made, over_scenes, random_groups, study
 from recipes.studies.tables import StudyTable, tell
-
-ADE = "ade"
 
 
 def windows(distance: Tensor, size: int, stride: int) -> list[Tensor]:

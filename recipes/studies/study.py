@@ -29,8 +29,10 @@ from recipes.common.scenes import fingerprint
 
 RANDOM_GROUPS = 8
 """Groups of rollouts drawn at random from a scene: what they score, a group of that size scores that nothing chose."""
-TAKEN = ("ade", "random")
-"""Names of rankings that every study has."""
+ADE = "ade"
+"""Displacement, the ranking that every study has beside those that it is given."""
+TAKEN = (ADE, "random")
+"""Names of rankings that studies give themselves."""
 Measure = Callable[[Rolled], dict[str, Any]]
 """Numbers of one scene from its rollouts, ready for JSON."""
 

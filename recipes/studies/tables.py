@@ -12,6 +12,7 @@ from rich import table as rich_table
 from rich.console import Console
 
 from dpa.report.statistics import Interval
+from dpa.report.table import MISSING
 from dpa.training.loggers import make_logger
 from recipes.common.cli import plain
 
@@ -103,7 +104,7 @@ def _as_name(title: str) -> str:
 
 def _text(cell: Cell, sign: str) -> str:
     if cell is None:
-        return "–"
+        return MISSING
     numbers = (cell.mean, cell.low, cell.high) if isinstance(cell, Interval) else (cell,)
     mean, *ends = (f"{number:{sign}.3f}" for number in numbers)
     return f"{mean} [{', '.join(ends)}]" if ends else mean
