@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictParams
@@ -18,8 +21,12 @@ def token_network(model: nn.Module) -> TensorDictModule:
     Args:
         model: called with a context of batch size ``[S]``, tokens ``[S, M, A, T]`` and their validity
             ``[S, M or 1, A, T]``; gives logits ``[S, M, A, T, V]`` (:class:`~dpa.policy.MotionLM` does).
+
+    Returns:
+        The network, in training or evaluation mode as the model is.
     """
-    return TensorDictModule(model, in_keys=[CONTEXT, "tokens", "token_valid"], out_keys=[LOGITS])
+    network = TensorDictModule(model, in_keys=[CONTEXT, "tokens", "token_valid"], out_keys=[LOGITS])
+    return network.train(model.training)
 
 
 def hold_network(loss: LossModule, network: TensorDictModule, *, keep_reference: bool) -> None:
@@ -38,11 +45,28 @@ def logits_under(parameters: TensorDictParams, network: TensorDictModule, batch:
 
 def reference_logits(loss: LossModule, batch: TensorDictBase) -> Tensor:
     """Logits of the frozen copy of a loss's network: without gradients, and without dropout even in training."""
-    network, training = loss.actor_network, loss.actor_network.training
-    with torch.no_grad():
-        logits = logits_under(loss.target_actor_network_params, network.eval(), batch)
-    network.train(training)
-    return logits
+    with torch.no_grad(), without_dropout(loss.actor_network) as network:
+        return logits_under(loss.target_actor_network_params, network, batch)
+
+
+@contextmanager
+def without_dropout(module: nn.Module) -> Iterator[nn.Module]:
+    """A module in evaluation mode; afterwards each part of it is in its own mode again.
+
+    Examples:
+        >>> model = nn.Sequential(nn.Dropout().eval(), nn.Dropout())
+        >>> with without_dropout(model) as asked:
+        ...     [part.training for part in asked]
+        [False, False]
+        >>> [part.training for part in model]
+        [False, True]
+    """
+    in_training = [part for part in module.modules() if part.training]
+    try:
+        yield module.eval()
+    finally:
+        for part in in_training:
+            part.training = True
 
 
 def masked_mean(value: Tensor, mask: Tensor) -> Tensor:

@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, MutableMapping
+from statistics import fmean
 from typing import Any
 
 WINDOW = 10
 """Steps that the share of saturated pairs is averaged over."""
 TOO_MANY = 0.5
 """Share of saturated pairs above which the loss says who happened to be likely, rather than who is preferred."""
+ALIKE = 0.1
+"""Spread of the pairs' weights below which they weigh alike."""
+ROUNDING = 1e-6
+"""Of a share that is a sum of thirds and sixths in float32."""
 
 
 class SaturationWatch:
     """Gives one warning, once, when most of what a step compares is saturated.
 
     At the first step of a run, where the policy is still its reference, that step alone decides: what saturates
-    there does so by the options. Later the mean of the last :data:`WINDOW` steps does.
+    there does so by the options. Later the mean of the last :data:`WINDOW` steps does. Saturated pairs that all have
+    their full weight are no cause for it: they weigh alike, as at the start of a loss with a reference.
 
     Args:
         options: of the loss; ``link``, ``alpha``, ``score_reduction`` and ``reference`` are read where it has them.
@@ -26,7 +32,8 @@ class SaturationWatch:
 
     Examples:
         >>> watch = SaturationWatch({"alpha": 1.0, "reference": True, "score_reduction": "token_mean"})
-        >>> print(watch(0, {"saturated": 0.75, "logit_mean": 3.0, "logit_std": 4.0}))
+        >>> weights = {"weight_mean": 0.3, "weight_std": 0.4}
+        >>> print(watch(0, {"saturated": 0.75, "logit_mean": 3.0, "logit_std": 4.0, **weights}))
         75 % of the pairs are saturated since step 1: their weight follows how likely their rollouts are, not how
         clear the preference is. Lower method.loss.alpha=1.0 to 0.2.
     """
@@ -60,13 +67,24 @@ class SaturationWatch:
         """
         if self.found or "saturated" not in figures or self.options.get("link", "logistic") != "logistic":
             return None
-        window = self._state["window"] = [*self._state["window"], [step, float(figures["saturated"])]][-WINDOW:]
-        share = sum(value for _, value in window) / len(window)
-        if share <= TOO_MANY or (step > 0 and len(window) < WINDOW):
+        seen = [float(figures[name]) for name in ("saturated", "weight_mean", "weight_std")]
+        window = self._state["window"] = [*self._state["window"], [step, *seen]][-WINDOW:]
+        steps, shares, weights, spreads = zip(*window, strict=True)
+        share = fmean(shares)
+        if share <= TOO_MANY + ROUNDING or (step > 0 and len(window) < WINDOW):
             return None
+        weight = fmean(weights)
+        spread = math.sqrt(fmean(w**2 + s**2 for w, s in zip(weights, spreads, strict=True)) - weight**2)
+        if spread < ALIKE and weight > 0.5:
+            return None
+        reason = (
+            "hardly any of them weighs anything, and nothing is learnt from the others"
+            if spread < ALIKE
+            else "their weight follows how likely their rollouts are, not how clear the preference is"
+        )
         self._state["found"] = (
-            f"{100 * share:.0f} % of the pairs are saturated since step {window[0][0] + 1}: their weight follows "
-            f"how likely their rollouts are, not how clear the preference is. {self._advice(figures)}."
+            f"{100 * share:.0f} % of the pairs are saturated since step {steps[0] + 1}: {reason}. "
+            f"{self._advice(figures)}."
         )
         return self.found
 

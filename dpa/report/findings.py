@@ -142,8 +142,8 @@ def saturated(experiment: Experiment, folder: Path) -> str | None:
     if not told:
         return None
     return (
-        f"Saturated: {', '.join(told)}. The weights of their pairs follow how likely rollouts are, not how clear the "
-        "preference is."
+        f"Saturated: {', '.join(told)}. The weights of their pairs say little about how clear a preference is; the "
+        "warning of each run says why, and what to change."
     )
 
 

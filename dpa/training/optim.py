@@ -129,12 +129,15 @@ def accumulate_gradients(
         (tensor(3.), tensor(3.))
     """
     means: dict[str, Tensor] = {}
+    kinds: dict[str, torch.dtype] = {}
     for (batch, share), last in _mark_last(parts):
         with without_sync(loss, last):
             found = loss(batch)
             total = sum(value for key, value in found.items() if key.startswith("loss_"))
             (ranks.world_size * share * total).backward()  # the exchange divides by the number of ranks
-        figures = {key: value.detach() for key, value in found.items()}
+        # In float64, because a spread is the difference of two large numbers.
+        figures = {key: value.detach().double() for key, value in found.items()}
+        kinds |= {key: value.dtype for key, value in found.items()}
         for key in _spreads(figures):
             figures[key] = figures[key] ** 2 + figures[key.removesuffix("_std") + "_mean"] ** 2
         for key, value in figures.items():
@@ -144,7 +147,7 @@ def accumulate_gradients(
     means = ranks.sum_figures(means)
     for key in _spreads(means):
         means[key] = (means[key] - means[key.removesuffix("_std") + "_mean"] ** 2).clamp(min=0).sqrt()
-    return means
+    return {key: value.to(kinds[key]) for key, value in means.items()}
 
 
 def _mark_last(parts: Iterable[T]) -> Iterator[tuple[T, bool]]:

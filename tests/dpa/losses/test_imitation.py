@@ -58,6 +58,15 @@ def test_the_copy_is_asked_without_dropout() -> None:
     assert loss.actor_network.training, "the policy keeps its dropout"
 
 
+def test_a_policy_without_dropout_stays_without() -> None:
+    model = MotionLM(dataclasses.replace(SIZES["nano"], dropout=0.5), VerletTokenizer()).eval()
+    loss = ImitationLoss(token_network(model))
+    batch = collate_items([log_item(make_context(straight_road(2)), VerletTokenizer())])
+    first, second = loss(batch), loss(batch)
+    assert first["loss_next_token"] == second["loss_next_token"] and second["kl"] == 0
+    assert not any(part.training for part in model.modules())
+
+
 def test_the_copy_is_not_trained(network: tuple, best: TensorDict) -> None:
     loss = ImitationLoss(network[0])
     optimizer = torch.optim.SGD(loss.parameters(), lr=2.0)

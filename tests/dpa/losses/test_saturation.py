@@ -6,6 +6,7 @@ import json
 import re
 
 import pytest
+import torch
 
 from dpa.losses import SaturationWatch
 from dpa.losses.saturation import WINDOW
@@ -13,8 +14,12 @@ from dpa.losses.saturation import WINDOW
 PLAIN = {"alpha": 0.1, "reference": False, "score_reduction": "sum"}
 
 
-def figures(saturated: float, mean: float = 0.0, std: float = 10.0) -> dict[str, float]:
-    return {"saturated": saturated, "logit_mean": mean, "logit_std": std}
+def figures(
+    saturated: float, mean: float = 0.0, std: float = 10.0, weight: float = 0.5, spread: float = 0.5
+) -> dict[str, float]:
+    """Of a step; by default half of the pairs have their full weight and the others none."""
+    logits = {"logit_mean": mean, "logit_std": std}
+    return {"saturated": saturated, "weight_mean": weight, "weight_std": spread, **logits}
 
 
 def said(watch: SaturationWatch, shares: list[float], first: int = 0) -> dict[int, str]:
@@ -37,6 +42,27 @@ def test_later_the_mean_of_the_last_steps_decides() -> None:
 
 def test_half_of_the_pairs_is_not_too_many() -> None:
     assert not said(SaturationWatch(PLAIN), [0.5] * 30)
+
+
+def test_half_of_the_pairs_is_not_too_many_where_shares_are_rounded() -> None:
+    sixths = [float(torch.tensor(count / 6)) for count in (1, 5, 2, 4, 5, 1, 4, 2, 1, 5)]
+    assert not said(SaturationWatch(PLAIN), sixths * 3)
+
+
+def test_pairs_that_all_have_their_full_weight_are_weighed_alike() -> None:
+    watch = SaturationWatch(PLAIN)
+    assert not any(watch(step, figures(1.0, mean=-20.0, weight=0.999, spread=0.001)) for step in range(30))
+
+
+def test_pairs_that_weigh_alike_within_each_step_but_not_among_steps_are_told() -> None:
+    watch = SaturationWatch(PLAIN)
+    one_pair = [watch(step, figures(1.0 if step else 0.0, weight=step % 2, spread=0.0)) for step in range(30)]
+    assert any(told and "how likely their rollouts are" in told for told in one_pair)
+
+
+def test_pairs_that_hardly_weigh_are_told_as_what_they_are() -> None:
+    told = SaturationWatch({**PLAIN, "reference": True})(0, figures(1.0, mean=50.0, std=1.0, weight=0.0, spread=0.0))
+    assert "hardly any of them weighs anything" in told and "lower method.loss.alpha=0.1 to 0.002" in told
 
 
 def test_a_run_that_goes_on_waits_for_enough_steps() -> None:

@@ -8,9 +8,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tensordict import TensorDict
 from torch import nn
 
-from dpa.training.optim import clip_and_step, make_optimizer, make_schedule
+from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
 
 
 class Net(nn.Module):
@@ -67,6 +68,19 @@ def test_an_impossible_schedule_is_refused(warmup: int, shape: str) -> None:
     optimizer = make_optimizer(nn.Linear(1, 1), lr=1.0, weight_decay=0.0)
     with pytest.raises(ValueError, match="must"):
         make_schedule(optimizer, 5, warmup, shape)
+
+
+@pytest.mark.parametrize(("mean", "std"), [(0.5, 1e-4), (1.0, 5e-5), (-700.0, 0.02)])
+def test_a_small_spread_around_a_large_mean_outlives_the_parts_of_a_batch(mean: float, std: float) -> None:
+    weight = torch.ones((), requires_grad=True)
+
+    def loss(batch: TensorDict) -> TensorDict:
+        return TensorDict({"loss_x": weight * 0, "logit_mean": batch["mean"], "logit_std": batch["std"]})
+
+    part = TensorDict({"mean": torch.tensor(mean), "std": torch.tensor(std)})
+    found = accumulate_gradients(loss, [(part, 0.5), (part, 0.25), (part, 0.25)])
+    assert found["logit_std"].item() == pytest.approx(std, rel=1e-3)
+    assert found["logit_mean"].dtype == found["logit_std"].dtype == torch.float32
 
 
 def test_gradients_are_clipped_and_the_norm_before_clipping_is_returned() -> None:
