@@ -10,14 +10,12 @@ Methods differ in one YAML each: dpa_omf, dpa_adef, sft_best_oa, sft_best_ade, a
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 
 import hydra
 from omegaconf import DictConfig
 
 from dpa.losses import SaturationWatch
-from dpa.preferences import PreferenceStore
 from dpa.report.curves import read_curves
 from dpa.report.findings import SATURATED
 from dpa.training.batches import ShuffledOrder
@@ -29,17 +27,14 @@ from envs.files import write_json
 from envs.progress import full_name, message
 from envs.seeding import make_generator
 from envs.store import SceneStore
-from recipes.alignment.candidates import SIDES, Candidates, make_candidates
+from recipes.alignment.candidates import Candidates
 from recipes.alignment.draws import parts_of
+from recipes.alignment.inputs import Inputs
 from recipes.alignment.losses import check_fit, make_loss
-from recipes.alignment.watch import ImitationLook, Look, Watch
-from recipes.common.cli import CONFIG, check_steps, deciding, finished, finite, plain, ranked_recipe
-from recipes.common.models import check_written, open_policy, weights_digest, write_policy
-from recipes.common.rankings import open_preferences
-from recipes.common.scenes import fingerprint, open_splits
-
-OBSERVING = ("checkpoint_interval", "max_rows", "snapshots", "watch_interval", "watch_scenes", "watch_pairs")
-"""Options of the section ``alignment`` that change nothing about the policy."""
+from recipes.alignment.watch import Watch
+from recipes.common.cli import CONFIG, check_steps, finished, finite, ranked_recipe
+from recipes.common.models import check_written, write_policy
+from recipes.common.scenes import open_splits
 
 
 def align(
@@ -87,20 +82,8 @@ def align(
     options, path, result = cfg.alignment, folder / "policy.pt", folder / "result.json"
     ranks.share_of(options.scenes_per_step, "alignment.scenes_per_step")
     device = ranks.place(cfg.device)
-    model, context, config = open_policy(policy, device)
-    store = open_preferences(preferences, scenes, model, policy)
-    played = None if expert is None else PreferenceStore(expert)
-    learnt = sorted(set(store.scenes.tolist()) & set(store.scenes.tolist() if among is None else among))
-    decided_by = {
-        "data": plain(method.data),
-        "loss": plain(method.loss),
-        "alignment": deciding(options, *OBSERVING),
-        "scenes": fingerprint(scenes.subset(learnt)),
-        "seed": seed,
-        "reference": weights_digest(model),
-        "preferences": asdict(store.provenance),
-        "expert": None if played is None else asdict(played.provenance),
-    }
+    inputs = Inputs.open(policy, preferences, expert, scenes, among, device)
+    model, decided_by = inputs.model, inputs.deciding(method, options, seed)
     snapshots = {step: folder / f"step_{step}" / "policy.pt" for step in options.snapshots if step <= options.steps}
     kept = finished(result, decided_by)
     if ranks.agree(kept is not None and path.is_file(), "finished =", folder):
@@ -109,14 +92,9 @@ def align(
         tell(method, kept.get(SATURATED), ranks)
         return path
     seed_everything(seed)
-    candidates = make_candidates(method.data, store, scenes, context, model.tokenizer.cpu(), seed, played, learnt)
+    candidates = inputs.candidates(method.data, seed)
     check_enough(candidates, options.pairs_per_scene)
-    model = model.to(device)
-    looks: list[Look | ImitationLook] = []
-    if ranks.main and watch is not None:
-        looks.append(Look(watch, context, model, options))
-    if ranks.main and SIDES[method.data.kind] == "targets" and store.provenance.num_rollouts > 1:
-        looks.append(ImitationLook(store, scenes, context, model, options, method.data.rank_by, learnt))
+    looks = inputs.looks(method.data, options, watch) if ranks.main else []
     loss = ranks.wrap(make_loss(method.loss, model))
     optimizer = make_optimizer(model, options.lr, options.weight_decay)
     schedule = make_schedule(optimizer, options.steps, options.warmup)
@@ -150,9 +128,9 @@ def align(
             for look in looks if done % options.watch_interval == 0 or done == options.steps else ():
                 run.log(look(device))
             if ranks.main and done in snapshots:
-                write_policy(snapshots[done], model, config, described | {"step": done})
+                write_policy(snapshots[done], model, inputs.config, described | {"step": done})
     if ranks.main:
-        write_policy(path, model, config, described)
+        write_policy(path, model, inputs.config, described)
         last = {name: finite(curve["value"][-1]) for name, curve in read_curves(folder).items()}
         warned = {} if saturation.found is None else {SATURATED: saturation.found}
         write_json(result, {"options": decided_by, "policy": str(path), "last_step": last, **warned})

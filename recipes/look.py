@@ -92,8 +92,9 @@ def distance_of(store: PreferenceStore) -> PreferenceDistance:
             f"{store.folder} was ranked with the features {unknown}, which are not registered here; add them to "
             "dpa/ranking/features/more.py."
         )
-    names = [name for name in FEATURES if name in options["weights"]]  # JSON has lost their order
-    return build(PreferenceDistance, DictConfig({**options, "features": names}), f"{store.folder}: ranking")
+    return build(
+        PreferenceDistance, DictConfig({**options, "features": list(options["weights"])}), f"{store.folder}: ranking"
+    )
 
 
 def chosen_rollout(rank: Tensor, name: str) -> int:

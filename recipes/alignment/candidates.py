@@ -115,14 +115,15 @@ def make_candidates(
     if data.kind == "expert":
         expert = _check_expert(data, store, expert)
     contexts = Contexts(scenes, options)
-    chosen = _choose(data, store, seed)
+    rows = [row for row, scene in enumerate(store.scenes.tolist()) if among is None or scene in among]
     groups = []
-    for row, scene in enumerate(store.scenes.tolist()):
-        if not len(chosen[row].preferred) or (among is not None and scene not in among):
+    for row, chosen in zip(rows, _choose(data, store, rows, seed), strict=True):
+        if not len(chosen.preferred):
             continue
+        scene = int(store.scenes[row])
         context = contexts[scene]
         ranked = store.read([row], num_agents=len(context.kind))[0]
-        group = _group(data, context, ranked, chosen[row])
+        group = _group(data, context, ranked, chosen)
         if data.kind == "adversarial":
             log = log_item(context, tokenizer)
             group = _against(group, log.tokens.expand(data.num, -1, -1), log.token_valid)
@@ -135,7 +136,7 @@ def make_candidates(
         groups.append(group)
     if not (kept := [group for group in groups if group.token_valid.any()]):
         raise ValueError(
-            f"none of the {len(store)} scenes of {store.folder} has anything to learn from; raise "
+            f"none of the {len(rows)} scenes of {store.folder} has anything to learn from; raise "
             "method.data.rankings_per_scene, or take more scenes."
         )
     return kept
@@ -156,14 +157,14 @@ def _against(group: Group, preferred: Tensor, token_valid: Tensor) -> Group:
     return group._replace(preferred=preferred, token_valid=group.token_valid & token_valid)
 
 
-def _choose(data: DictConfig, store: PreferenceStore, seed: int) -> list[Chosen]:
-    """Rollouts of every scene of the store; M and N may differ among scenes for pairs only."""
+def _choose(data: DictConfig, store: PreferenceStore, rows: list[int], seed: int) -> list[Chosen]:
+    """Rollouts of some scenes, whatever others the store holds; M and N may differ among scenes for pairs only."""
     if data.kind not in RANKED:
         held = store.provenance.num_rollouts
-        draws = [make_generator(seed, data.kind, scene) for scene in store.scenes.tolist()]
-        rows = [random_rollouts(1, held, data.num, draw)[0] for draw in draws]
-        return [Chosen(drawn, drawn) for drawn in rows]
-    distance = store.distance if data.rank_by == keys.DISTANCE else store.ade
+        draws = [make_generator(seed, data.kind, scene) for scene in store.scenes[rows].tolist()]
+        drawn = [random_rollouts(1, held, data.num, draw)[0] for draw in draws]
+        return [Chosen(each, each) for each in drawn]
+    distance = (store.distance if data.rank_by == keys.DISTANCE else store.ade)[rows]
     if data.kind == "pairs":
         return _choose_pairs(data, distance, seed)
     order = nearest(distance, distance.shape[-1])
@@ -175,7 +176,7 @@ def _choose(data: DictConfig, store: PreferenceStore, seed: int) -> list[Chosen]
         held = order.shape[-1]
         ranks = torch.linspace(0, held - 1, data.num or held, dtype=torch.float64).round().long()
         sides = order[:, ranks].tensor_split([(len(ranks) + 1) // 2], dim=1)
-    return [Chosen(*rows) for rows in zip(*sides, strict=True)]
+    return [Chosen(*each) for each in zip(*sides, strict=True)]
 
 
 def _choose_pairs(data: DictConfig, distance: Tensor, seed: int) -> list[Chosen]:
@@ -193,11 +194,11 @@ def _choose_pairs(data: DictConfig, distance: Tensor, seed: int) -> list[Chosen]
         )
     if data.rankings_per_scene is not None:
         kept = thin_out(kept, data.rankings_per_scene, make_generator(seed, "rankings"))
-    return [Chosen(near[rows], far[rows]) for near, far, rows in zip(preferred, unpreferred, kept, strict=True)]
+    return [Chosen(near[pairs], far[pairs]) for near, far, pairs in zip(preferred, unpreferred, kept, strict=True)]
 
 
 def num_candidates(data: DictConfig, held: int) -> tuple[int, int]:
-    """How many rollouts of a scene stand on either side, M and N, before any pair is left out.
+    """How many rollouts of a scene that is learnt from stand on either side, M and N; a margin may leave fewer.
 
     Args:
         data: of a method, see :func:`make_candidates`.
@@ -213,6 +214,8 @@ def num_candidates(data: DictConfig, held: int) -> tuple[int, int]:
         whole = data.num or held
         return (whole + 1) // 2, whole // 2
     num = held * (held - 1) // 2 if data.kind == "pairs" and data.pairs == "all" else data.num
+    if data.kind == "pairs" and data.rankings_per_scene is not None:
+        num = min(num, max(1, int(data.rankings_per_scene)))  # of half a pair in the mean, a scene has one or none
     return num, {"best": 0, "sets": data.get("num_unpreferred")}.get(data.kind, num)
 
 
@@ -229,9 +232,9 @@ def check_data(data: DictConfig, held: int) -> DictConfig:
     Raises:
         ValueError: an unknown kind, ranking or way to pair, or more rollouts than there are.
     """
-    data = _counted(data, held)
-    _check(data, held)
-    return data
+    counted = _counted(data, held)
+    _check(counted, held, data)
+    return counted
 
 
 def _counted(data: DictConfig, held: int) -> DictConfig:
@@ -243,7 +246,13 @@ def _counted(data: DictConfig, held: int) -> DictConfig:
     return OmegaConf.merge(data, {name: max(1, round(share * held)) for name, share in shares.items()})
 
 
-def _check(data: DictConfig, held: int) -> None:
+def _asked(given: DictConfig, data: DictConfig, name: str) -> str:
+    """An option as it was given, and the number that it stands for where it is a share."""
+    told = f"method.data.{name}={given[name]}"
+    return told if given[name] == data[name] else f"{told} ({data[name]})"
+
+
+def _check(data: DictConfig, held: int, given: DictConfig) -> None:
     if data.kind not in SIDES:
         raise ValueError(f"method.data.kind must be one of {', '.join(SIDES)}, got {data.kind!r}.")
     if data.kind in RANKED and data.rank_by not in (keys.DISTANCE, keys.ADE):
@@ -253,7 +262,7 @@ def _check(data: DictConfig, held: int) -> None:
     if data.kind == "pairs" and data.pairs == "all":
         if data.num is not None:
             raise ValueError(
-                f"method.data.pairs=all takes every pair, and method.data.num={data.num} asks for some; say "
+                f"method.data.pairs=all takes every pair, and {_asked(given, data, 'num')} asks for some; say "
                 "method.data.num=null, and rankings_per_scene to keep fewer."
             )
         _check_pairs(data, held * (held - 1) // 2)
@@ -267,7 +276,7 @@ def _check(data: DictConfig, held: int) -> None:
             )
         if data[name] < 1:
             raise ValueError(f"method.data.{name} must be 1 or more, got {data[name]}.")
-    _check_enough(data, held)
+    _check_enough(data, held, given)
     if data.kind == "pairs":
         _check_pairs(data, data.num)
 
@@ -286,12 +295,13 @@ def _check_pairs(data: DictConfig, pairs: int) -> None:
         )
 
 
-def _check_enough(data: DictConfig, held: int) -> None:
-    asked, needed = f"method.data.num={data.num}", data.num
+def _check_enough(data: DictConfig, held: int, given: DictConfig) -> None:
+    asked, needed = _asked(given, data, "num"), data.num
     if data.kind == "pairs":
         needed *= 2
     elif data.kind == "sets":
-        asked, needed = f"{asked} and num_unpreferred={data.num_unpreferred}", needed + data.num_unpreferred
+        asked = f"{asked} and {_asked(given, data, 'num_unpreferred')}"
+        needed += data.num_unpreferred
     elif data.kind == "ranking" and data.num < 2:
         raise ValueError(f"a ranking needs two rollouts, got {asked}; say 2 or more, or null for all.")
     if needed > held:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +11,7 @@ from typing import NamedTuple
 from numpy import nanmean
 from omegaconf import DictConfig
 
+from dpa.losses.network import without_dropout
 from dpa.policy import ContextOptions, MotionLM
 from dpa.preferences import PreferenceStore
 from envs.store import SceneStore
@@ -45,11 +45,16 @@ class Look:
         options: the section ``alignment``.
 
     Raises:
-        ValueError: rollouts of other scenes than the tuning ones.
+        ValueError: rollouts of other scenes than the tuning ones, or one of each alone.
     """
 
     def __init__(self, watch: Watch, context: ContextOptions, model: MotionLM, options: DictConfig) -> None:
         store = open_ranked_scenes(watch.preferences, watch.scenes)
+        if store.provenance.num_rollouts < 2:
+            raise ValueError(
+                f"{store.folder} holds one rollout of each scene, and a pair needs two; collect again with "
+                "collection.num_rollouts=2 or more."
+            )
         rows = range(min(options.watch_scenes, len(store)))
         pairs = min(options.watch_pairs, store.provenance.num_rollouts // 2)
         tokenizer = copy.deepcopy(model.tokenizer).cpu()  # logs are read on the CPU, wherever the model is
@@ -59,7 +64,7 @@ class Look:
 
     def __call__(self, device: str) -> dict[str, float]:
         """Means over the scenes, as curves are named."""
-        with _without_dropout(self.model):
+        with without_dropout(self.model):
             found = probe(self.model, self.reference, self.probes, device)
         return {f"tune/{name}": nanmean([each[name] for each in found]) for name in (*PROBED, "kl")}
 
@@ -99,16 +104,6 @@ class ImitationLook:
 
     def __call__(self, device: str) -> dict[str, float]:
         """Means over the scenes, as curves are named."""
-        with _without_dropout(self.model):
+        with without_dropout(self.model):
             found = probe_sides(self.model, self.probes, device)
         return {f"train/{name}": nanmean([each[name] for each in found]) for name in SIDED}
-
-
-@contextmanager
-def _without_dropout(model: MotionLM) -> Iterator[None]:
-    training = model.training
-    model.eval()
-    try:
-        yield
-    finally:
-        model.train(training)

@@ -58,6 +58,11 @@ def _check_decodings(cfg: DictConfig) -> None:
 
 
 def _check_rankings(cfg: DictConfig) -> None:
+    if cfg.collection.num_rollouts < 2:
+        raise ValueError(
+            f"collection.num_rollouts={cfg.collection.num_rollouts} of a scene make no pair, whose accuracy is told of "
+            "every method; say 2 or more."
+        )
     own = build_distance(cfg.collection.ranking, "collection.ranking")
     for name, options in cfg.rankings.items():
         build_distance(ranking_options(cfg.collection.ranking, options), f"rankings.{name}")
@@ -78,7 +83,8 @@ def _check_methods(cfg: DictConfig) -> None:
         unknown = sorted(set(setup.alignment) - set(cfg.alignment))
         if unknown:
             raise ValueError(f"experiment.setup.{name}.alignment has no option {unknown[0]!r}.")
-        check_steps(setup.merged(cfg.alignment), f"alignment of {name}:")
+        with told_of(f"methods.{name}"):
+            check_steps(setup.merged(cfg.alignment), "alignment")
 
 
 def _check_labels(cfg: DictConfig) -> None:

@@ -27,7 +27,7 @@ from recipes.common.models import open_policy, weights_digest
 from recipes.common.rankings import TimedDistance, build_distance, open_ranked_scenes, ranking_options
 from recipes.common.scenes import fingerprint, open_splits
 from recipes.evaluate import evaluate, mean_known
-from recipes.experiment.methods import setup_of
+from recipes.experiment.methods import drawing_seed, setup_of
 from recipes.experiment.runs import Run, RunFolder
 from recipes.pretrain import pretrain
 from recipes.rerank import rerank
@@ -45,7 +45,8 @@ def collect_job(cfg: DictConfig, seed: int, split: str, source: str) -> dict[str
     runs, scenes = runs_of(cfg), open_splits(cfg.scenes)[split]
     indices = learnt_from(cfg, len(scenes)) if split == "train" else None
     distance = TimedDistance(build_distance(cfg.collection.ranking, "collection.ranking"))
-    collect(cfg, scenes, runs.policy(seed, source), seed, runs.preferences(seed, split, source), indices, distance)
+    drawn, folder = drawing_seed(cfg, seed, source), runs.preferences(seed, split, source)
+    collect(cfg, scenes, runs.policy(seed, source), drawn, folder, indices, distance)
     return {"rank": distance.seconds}
 
 
@@ -76,7 +77,7 @@ def align_job(cfg: DictConfig, seed: int, method: str) -> dict[str, float]:
             splits.train,
             runs.policy(seed, setup.start),
             runs.preferences(seed, "train", setup.start, setup.ranking),
-            seed,
+            drawing_seed(cfg, seed, setup.start),
             folder,
             expert=None if setup.expert is None else runs.preferences(seed, "train", setup.expert),
             watch=Watch(splits.tune, runs.preferences(seed, "tune"), runs.policy(seed, REFERENCE)),

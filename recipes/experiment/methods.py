@@ -9,6 +9,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from dpa.report.table import REFERENCE
+from envs.seeding import derive_seed
 from recipes.common.cli import build
 from recipes.experiment.runs import SNAPSHOT
 
@@ -23,7 +24,7 @@ class Setup:
         expert: method whose rollouts are the preferred ones (``data.kind: expert``).
         ranking: name of the distance, in ``rankings``, that ranks the rollouts again; None keeps the collection's.
         alignment: options of the section ``alignment`` that differ.
-        length: of the alignment, in lengths of that section: a control for rounds.
+        length: of the alignment and between its snapshots, in lengths of that section: a control for rounds.
     """
 
     start: str = REFERENCE
@@ -35,13 +36,46 @@ class Setup:
     def merged(self, section: DictConfig) -> DictConfig:
         """The section ``alignment`` of this method."""
         options = OmegaConf.merge(section, self.alignment)
-        return OmegaConf.merge(options, {"steps": round(self.length * options.steps)})
+        times = {
+            "steps": round(self.length * options.steps),
+            "snapshots": [round(self.length * step) for step in options.snapshots],
+        }
+        return OmegaConf.merge(options, times)
 
 
 def setup_of(cfg: DictConfig, method: str) -> Setup:
     """The setup of one method."""
     given = cfg.experiment.setup.get(method)
     return build(Setup, OmegaConf.create({}) if given is None else given, f"experiment.setup.{method}")
+
+
+def behind(cfg: DictConfig, policy: str) -> list[str]:
+    """Methods that must run before a policy is there, its own last and each once; none for the reference."""
+    if policy == REFERENCE:
+        return []
+    setup = setup_of(cfg, policy)
+    before = [*behind(cfg, setup.start), *behind(cfg, setup.expert or REFERENCE)]
+    return [*dict.fromkeys(before), policy]
+
+
+def drawing_seed(cfg: DictConfig, seed: int, policy: str) -> int:
+    """Seed of a policy's rollouts to learn from, and of the order in which they are learnt from.
+
+    Each round has its own. What a rollout draws is decided by seed, scene and k: with one seed for all rounds an
+    aligned policy would largely repeat the rollouts that it was aligned on.
+
+    Args:
+        cfg: of the study.
+        seed: of the study; that of the reference's rollouts.
+        policy: the reference or a method.
+
+    Returns:
+        An integer in ``[0, 2**32)``.
+    """
+    rounds = 0
+    while policy != REFERENCE:
+        policy, rounds = setup_of(cfg, policy).start, rounds + 1
+    return seed if rounds == 0 else derive_seed(seed, "round", rounds) % 2**32
 
 
 def read_setups(cfg: DictConfig) -> dict[str, Setup]:

@@ -19,7 +19,7 @@ from recipes.common.cli import plain
 from recipes.common.scenes import Splits
 from recipes.evaluate import SCENE_FIGURES, mean_known
 from recipes.experiment.jobs import runs_of
-from recipes.experiment.methods import setup_of
+from recipes.experiment.methods import behind, setup_of
 from recipes.experiment.runs import SNAPSHOT, Run, method_of
 
 TOLD = ("name", "title", "paper", "question", "headline", "axis", "split", "published")
@@ -175,21 +175,24 @@ def summarise_experiment(
 
 
 def budget(cfg: DictConfig, method: str) -> dict[str, Any]:
-    """What one training run takes in, with the runs that it goes on from and the expert that it learns from.
+    """What one method takes in, with the runs that it goes on from and the expert that it learns from.
 
     Returns:
         ``steps``, ``rollouts`` (read in these steps) and ``start``.
     """
-    setup = setup_of(cfg, method)
-    options, steps = setup.merged(cfg.alignment), steps_of(cfg, method)
-    held = num_candidates(cfg.methods[method].data, cfg.collection.num_rollouts)
-    before = [budget(cfg, name) for name in (setup.start, setup.expert) if name not in (None, REFERENCE)]
-    read = steps * options.scenes_per_step * sum(num_drawn(*held, options.pairs_per_scene))
+    runs = behind(cfg, method)
     return {
-        "steps": steps + sum(each["steps"] for each in before),
-        "rollouts": read + sum(each["rollouts"] for each in before),
-        "start": setup.start,
+        "steps": sum(steps_of(cfg, run) for run in runs),
+        "rollouts": sum(steps_of(cfg, run) * _read_in_step(cfg, run) for run in runs),
+        "start": setup_of(cfg, method).start,
     }
+
+
+def _read_in_step(cfg: DictConfig, method: str) -> int:
+    """Rollouts that a step of a method reads."""
+    options, data = setup_of(cfg, method).merged(cfg.alignment), cfg.methods[method].data
+    held = num_candidates(data, cfg.collection.num_rollouts)
+    return options.scenes_per_step * sum(num_drawn(*held, options.pairs_per_scene))
 
 
 def steps_of(cfg: DictConfig, policy: str) -> int:

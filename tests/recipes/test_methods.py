@@ -18,7 +18,7 @@ from recipes.common.cli import CONFIG
 from recipes.compare import choose, snapshots_of
 from recipes.experiment.check import check_experiment
 from recipes.experiment.jobs import runs_of
-from recipes.experiment.methods import read_setups
+from recipes.experiment.methods import drawing_seed, read_setups, setup_of
 from recipes.experiment.pool import Workers
 from recipes.experiment.runs import Run
 from recipes.experiment.stages import Stages, alone_in, read_account
@@ -81,7 +81,8 @@ def test_a_method_comes_after_those_that_it_starts_from_or_learns_from() -> None
             ("+experiment.setup.dpa_omf={alignment:{step:3}}",),
             "experiment.setup.dpa_omf.alignment has no option 'step'",
         ),
-        (("+experiment.setup.dpa_omf={alignment:{steps:5}}",), "alignment of dpa_omf:.warmup must be less than"),
+        (("+experiment.setup.dpa_omf={alignment:{steps:5}}",), "methods.dpa_omf: alignment.warmup must be less than"),
+        (("collection.num_rollouts=1",), "collection.num_rollouts=1 of a scene make no pair"),
         (("+experiment.setup.dpa_omf={length:0}",), "experiment.setup.dpa_omf.length must be above 0, got 0"),
         (("+experiment.setup.dpa_omf={expert:dpa_adef}",), "is for methods.dpa_omf.data.kind=expert, which is pairs"),
         (("ranking@collection.ranking=displacement",), "couples nothing; say pictures.scenes=0"),
@@ -179,6 +180,22 @@ def test_checkpoint_and_decoding_are_chosen_together_by_the_mean_over_seeds(tmp_
     assert len(asked) == len(set(asked)) == 2 * 2 * (1 + 2 * 5), "each policy of each seed once at each decoding"
 
 
+def test_each_round_draws_by_a_seed_of_its_own() -> None:
+    rounds = configuration("experiment=rounds")
+    seeds = [
+        drawing_seed(rounds, seed, policy) for seed in (0, 1) for policy in ("reference", "dpa_omf", "omf_round_2")
+    ]
+    assert seeds[0] == 0 and seeds[3] == 1, "the reference's rollouts are those of the seed itself"
+    assert len(set(seeds)) == 6 and all(0 <= seed < 2**32 for seed in seeds)
+    assert drawing_seed(rounds, 0, "omf_twice") == seeds[1], "two policies of one round draw the same"
+
+
+def test_snapshots_of_a_longer_alignment_lie_as_far_along() -> None:
+    cfg = configuration("experiment=rounds")
+    longer = setup_of(cfg, "omf_twice").merged(cfg.alignment)
+    assert (longer.steps, list(longer.snapshots)) == (300, [150])
+
+
 def test_a_budget_counts_what_a_method_starts_from_and_whom_it_learns_from() -> None:
     own = {"steps": 150, "rollouts": 150 * 6 * 2, "start": "reference"}
     rounds = configuration("experiment=rounds")
@@ -189,6 +206,11 @@ def test_a_budget_counts_what_a_method_starts_from_and_whom_it_learns_from() -> 
     assert budget(losses, "kto")["rollouts"] == 150 * 6 * (1 + 2), "of twice as many unpreferred ones twice as many"
     few = configuration("experiment=variants", "methods.combined.data.num=2")
     assert budget(few, "combined")["rollouts"] == 150 * 6 * 2 * 2, "of two pairs a step cannot take four"
+    far = configuration("experiment=losses", "+experiment.setup.afd_expert.start=sft_best_oa")
+    assert budget(far, "afd_expert")["steps"] == 300, "SFT is both its start and its expert, and runs once"
+    thinned = configuration("experiment=scaling", "alignment.pairs_per_scene=4")
+    assert budget(thinned, "omf_r2")["rollouts"] == 150 * 6 * 2 * 2, "of the two pairs that a scene keeps"
+    assert budget(thinned, "omf_r0_25")["rollouts"] == 150 * 6 * 2, "a scene that keeps one has one pair"
     assert expert == own | {"steps": 300, "rollouts": 150 * 6 * 2 + 150 * 6}, (
         "SFT reads one rollout where AfD reads two"
     )

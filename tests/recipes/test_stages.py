@@ -274,13 +274,18 @@ def test_a_margin_leaves_the_clear_pairs(runs: Path, options: Callable) -> None:
     [
         ({"pairs": "some"}, "method.data.pairs must be one of nearest_farthest, random, all, got 'some'"),
         ({"pairs": "all"}, "method.data.num=2 asks for some; say method.data.num=null"),
+        ({"pairs": "all", "num": 0.25}, "method.data.num=0.25 (1) asks for some"),
+        ({"num": 0.75}, "method.data.num=0.75 (3) needs 6 rollouts of a scene and there are 4"),
         ({"num": None}, "method.data.num must be a whole number, or a share between 0 and 1, got None"),
         ({"margin": 50.0}, "method.data.margin=50.0 leaves no pair"),
         ({"margin": -1.0}, "method.data.margin must be 0 or more, got -1.0"),
         ({"rankings_per_scene": 0}, "method.data.rankings_per_scene must be positive, got 0"),
         ({"kind": "best", "num": 0}, "method.data.num must be 1 or more, got 0"),
         ({"kind": "best", "num": 5}, "method.data.num=5 needs 5 rollouts of a scene and there are 4"),
-        ({"kind": "sets", "num_unpreferred": 3}, "num=2 and num_unpreferred=3 needs 5 rollouts"),
+        (
+            {"kind": "sets", "num_unpreferred": 3},
+            "method.data.num=2 and method.data.num_unpreferred=3 needs 5 rollouts",
+        ),
         (
             {"kind": "sets", "num_unpreferred": None},
             "num_unpreferred must be a whole number, or a share between 0 and 1, got None",
@@ -621,6 +626,16 @@ def test_alignment_learns_from_the_scenes_that_it_is_given(runs: Path, options: 
     assert len(every) == 6 and len(some) == 2
     for group, whole in zip(some, (every[1], every[4]), strict=True):
         assert torch.equal(group.preferred, whole.preferred)
+
+
+def test_rankings_are_thinned_among_the_scenes_that_are_learnt_from(runs: Path, options: Callable) -> None:
+    cfg = compose_recipe("align", options, runs)
+    store, scenes = PreferenceStore(runs / "preferences"), open_splits(cfg.scenes).train
+    model, context, _ = open_policy(runs / "reference/policy.pt")
+    data = OmegaConf.merge(cfg.method.data, {"num": 1, "rankings_per_scene": 0.5})
+    for seed in range(6):
+        groups = make_candidates(data, store, scenes, context, model.tokenizer, seed, among=[0, 1, 2, 4])
+        assert len(groups) == 2, "half a pair of each of the four, whatever the other two would keep"
 
 
 def saturating(runs: Path, options: Callable, folder: Path) -> list[str]:

@@ -1,0 +1,117 @@
+"""What an alignment starts from and learns from, read and checked."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from dpa.policy import ContextOptions, MotionLM
+from dpa.preferences import PreferenceStore
+from envs.store import SceneStore
+from recipes.alignment.candidates import SIDES, Candidates, make_candidates
+from recipes.alignment.watch import ImitationLook, Look, Watch
+from recipes.common.cli import deciding, plain
+from recipes.common.models import open_policy, weights_digest
+from recipes.common.rankings import open_preferences
+from recipes.common.scenes import fingerprint
+
+OBSERVING = ("checkpoint_interval", "max_rows", "snapshots", "watch_interval", "watch_scenes", "watch_pairs")
+"""Options of the section ``alignment`` that change nothing about the policy."""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """A policy, and ranked rollouts of it.
+
+    Attributes:
+        model: to align, without dropout.
+        context: how scenes are cut up for it.
+        config: of the model, as its file has it.
+        scenes: that the rollouts are of.
+        store: of the rollouts.
+        expert: store of the rollouts of an expert in the same scenes, if there is one.
+        learnt: indices of the scenes to learn from.
+    """
+
+    model: MotionLM
+    context: ContextOptions
+    config: dict[str, Any]
+    scenes: SceneStore
+    store: PreferenceStore
+    expert: PreferenceStore | None
+    learnt: list[int]
+
+    @classmethod
+    def open(
+        cls,
+        policy: Path,
+        preferences: Path,
+        expert: Path | None,
+        scenes: SceneStore,
+        among: Sequence[int] | None,
+        device: str,
+    ) -> Inputs:
+        """Read a policy and the stores.
+
+        Args:
+            policy: file of the policy.
+            preferences: folder of the store that :mod:`recipes.collect` made with it.
+            expert: folder of the store of an expert.
+            scenes: that the preferences are of.
+            among: indices of the scenes to learn from; by default all that the preferences are of.
+            device: of the model.
+
+        Raises:
+            ValueError: preferences of other scenes or of another policy.
+        """
+        model, context, config = open_policy(policy, device)
+        store = open_preferences(preferences, scenes, model, policy)
+        ranked = store.scenes.tolist()
+        learnt = sorted(set(ranked) & set(ranked if among is None else among))
+        return cls(model, context, config, scenes, store, None if expert is None else PreferenceStore(expert), learnt)
+
+    def deciding(self, method: DictConfig, alignment: DictConfig, seed: int) -> dict[str, Any]:
+        """All that decides what becomes of the policy: a run with the same goes on, or is finished.
+
+        Args:
+            method: ``data`` and ``loss``.
+            alignment: the section.
+            seed: of batches.
+        """
+        return {
+            "data": plain(method.data),
+            "loss": plain(method.loss),
+            "alignment": deciding(alignment, *OBSERVING),
+            "scenes": fingerprint(self.scenes.subset(self.learnt)),
+            "seed": seed,
+            "reference": weights_digest(self.model),
+            "preferences": asdict(self.store.provenance),
+            "expert": None if self.expert is None else asdict(self.expert.provenance),
+        }
+
+    def candidates(self, data: DictConfig, seed: int) -> Candidates:
+        """See :func:`~recipes.alignment.candidates.make_candidates`."""
+        tokenizer = copy.deepcopy(self.model.tokenizer).cpu()  # logs are read on the CPU, wherever the model is
+        return make_candidates(data, self.store, self.scenes, self.context, tokenizer, seed, self.expert, self.learnt)
+
+    def looks(self, data: DictConfig, alignment: DictConfig, watch: Watch | None) -> list[Look | ImitationLook]:
+        """What is looked at along the way: what no loss sees, and what a method that imitates does not see.
+
+        Args:
+            data: of the method.
+            alignment: the section.
+            watch: scenes that no loss sees, if some are to be looked at.
+        """
+        looks: list[Look | ImitationLook] = []
+        if watch is not None:
+            looks.append(Look(watch, self.context, self.model, alignment))
+        if SIDES[data.kind] == "targets" and self.store.provenance.num_rollouts > 1:
+            looks.append(
+                ImitationLook(self.store, self.scenes, self.context, self.model, alignment, data.rank_by, self.learnt)
+            )
+        return looks
