@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -39,18 +40,15 @@ def log_experiment(cfg: DictConfig, experiment: Experiment, pictures: Mapping[st
         The folder of the logs.
     """
     folder = experiment.path.with_suffix("")
-    logger = make_logger(cfg.logger.backend, folder, plain(cfg), name=experiment.name, mode=cfg.logger.mode)
-    try:
+    logs = make_logger(cfg.logger.backend, folder, plain(cfg), name=experiment.name, mode=cfg.logger.mode)
+    with closing(logs) as logger, tempfile.TemporaryDirectory() as drawn:
         for name, (titles, rows) in _tables(experiment):
             logger.table(name, titles, rows, 0)
         logger.log({name: value for name, value in _numbers(experiment) if value is not None}, 0)
-        with tempfile.TemporaryDirectory() as drawn:
-            differences = Path(drawn) / "differences.png"
-            plot_comparison(experiment, differences)
-            for name, picture in {"own_best/differences": differences, **pictures}.items():
-                logger.picture(name, picture, 0)
-    finally:
-        logger.close()
+        differences = Path(drawn) / "differences.png"
+        plot_comparison(experiment, differences)
+        for name, picture in {"own_best/differences": differences, **pictures}.items():
+            logger.picture(name, picture, 0)
     return folder
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -79,16 +80,14 @@ def tell(cfg: DictConfig, tables: Sequence[StudyTable], pictures: Mapping[str, P
         pictures: files by the names that they have in the logs.
     """
     folder = Path(cfg.output)
-    logger = make_logger(cfg.logger.backend, folder, plain(cfg), name=folder.name, mode=cfg.logger.mode)
-    try:
+    logs = make_logger(cfg.logger.backend, folder, plain(cfg), name=folder.name, mode=cfg.logger.mode)
+    with closing(logs) as logger:
         for table in tables:
             _print(table)
             logger.table(f"{table.name}/table", *table.kept(), 0)
             logger.log(dict(table.numbers()), 0)
         for name, picture in pictures.items():
             logger.picture(name, picture, 0)
-    finally:
-        logger.close()
 
 
 def _print(table: StudyTable) -> None:
