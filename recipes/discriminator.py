@@ -36,7 +36,15 @@ from recipes.common.scenes import fingerprint, open_splits
 from recipes.studies.adversary import best_look, fit
 from recipes.studies.motions import MotionShelf, Sight, driven_log
 from recipes.studies.spurious import QUANTITIES, RANKINGS, summarise
-from recipes.studies.study import RANDOM_GROUPS, as_json, how_made, random_groups, rolled_out, study_policy
+from recipes.studies.study import (
+    RANDOM_GROUPS,
+    as_json,
+    check_readable,
+    how_made,
+    random_groups,
+    rolled_out,
+    study_policy,
+)
 from recipes.studies.tables import StudyTable, tell
 
 FIGURES = ("realism", "kinematic", "interactive", "map_based")
@@ -195,6 +203,7 @@ def main(cfg: DictConfig) -> None:
     metric = RealismConfig.load(str(cfg.metric))
     sight, distance = build(Sight, cfg.sight, "sight"), build_distance(cfg.ranking, "ranking")
     policies, splits = policies_of(cfg), open_splits(cfg.scenes)
+    check_readable(policies)
     scenes, measured, training = splits[cfg.split], {}, {}
     for name, path in policies.items():
         net, training[name] = trained(cfg, splits.train, path, name)

@@ -69,7 +69,7 @@ def random_tokens(tokenizer: MotionTokenizer) -> Rung:
     """Every token as likely as any other, at every decision."""
 
     def roll(scene: Scene, num_rollouts: int, generator: torch.Generator) -> Tensor:
-        recent, kind = _recent(scene, tokenizer.steps), scene.agents.kind[scene.agents.present]
+        recent, kind = _seen(scene, tokenizer.steps)
         steps = _log(scene).shape[1] // tokenizer.steps
         tokens = torch.randint(tokenizer.vocab_size, (num_rollouts, len(kind), steps), generator=generator)
         return lifted(scene, tokenizer.decode_tracks(tokens, recent.expand(num_rollouts, -1, -1, -1), kind))
@@ -81,12 +81,18 @@ def tokenized_log(tokenizer: MotionTokenizer) -> Rung:
     """The log through tokens and back, in every rollout: the best that any model of these tokens could do alike."""
 
     def roll(scene: Scene, num_rollouts: int, generator: torch.Generator) -> Tensor:
-        recent, kind = _recent(scene, tokenizer.steps), scene.agents.kind[scene.agents.present]
+        recent, kind = _seen(scene, tokenizer.steps)
         poses = _log(scene)[..., [0, 1, 3]]
         tracks = tokenizer.encode_tracks(poses, torch.ones(poses.shape[:2], dtype=torch.bool), recent, kind)
         return lifted(scene, tracks.poses[None]).expand(num_rollouts, -1, -1, -1)
 
     return roll
+
+
+def _seen(scene: Scene, steps: int) -> tuple[Tensor, Tensor]:
+    """What a policy sees of the present agents: ``[A, F + 1, 3]`` before the first decision, and their kinds."""
+    present = scene.agents.present
+    return scene.agents.recent(steps)[present], scene.agents.kind[present]
 
 
 def _log(scene: Scene) -> Tensor:
@@ -96,13 +102,6 @@ def _log(scene: Scene) -> Tensor:
     steps = torch.arange(poses.shape[1])
     last = torch.where(agents.valid[agents.present, CURRENT_STEP:], steps, 0).cummax(1).values
     return poses.gather(1, last[..., None].expand_as(poses))[:, 1:]
-
-
-def _recent(scene: Scene, steps: int) -> Tensor:
-    """``[A, F + 1, 3]`` before the first decision; a step that the log lacks is taken for the current one."""
-    agents, window = scene.agents, slice(CURRENT_STEP - steps, CURRENT_STEP + 1)
-    poses = torch.cat((agents.position[..., :2], agents.heading[..., None]), -1)[agents.present, window]
-    return torch.where(agents.valid[agents.present, window, None], poses, poses[:, -1:])
 
 
 def score_rung(scenes: SceneSource, rollouts: Iterator[tuple[int, Tensor]], years: list[str], name: str) -> dict:
@@ -146,6 +145,10 @@ def rungs(cfg: DictConfig, scenes: SceneSource) -> Iterator[tuple[str, dict[str,
     config = policy_config(cfg.model)
     seed_everything(seed)
     untrained = build_policy(config)
+    decoding = {"decoding": plain(cfg.decoding)}
+    models = {"untrained model": (untrained, context_options(cfg.model), config)}
+    for name, path in (policies_of(cfg) if cfg.policies else {}).items():
+        models[name] = open_policy(path, cfg.device)
     made = {
         "log": logged,
         "log through tokens": tokenized_log(untrained.tokenizer),
@@ -155,10 +158,6 @@ def rungs(cfg: DictConfig, scenes: SceneSource) -> Iterator[tuple[str, dict[str,
     }
     for name, rung in made.items():
         yield name, {"tokenizer": plain(cfg.model.tokenizer)}, crude(scenes, rung, count, seed)
-    decoding = {"decoding": plain(cfg.decoding)}
-    models = {"untrained model": (untrained, context_options(cfg.model), config)}
-    for name, path in (policies_of(cfg) if cfg.policies else {}).items():
-        models[name] = open_policy(path, cfg.device)
     for name, (model, context, config) in models.items():
         yield name, decoding | {"policy": weights_digest(model), **config}, driven(scenes, model, context, cfg)
 

@@ -20,7 +20,7 @@ import torch
 from omegaconf import DictConfig
 
 from dpa.preferences import nearest_farthest
-from dpa.ranking import Distance
+from dpa.ranking import DisplacementDistance, Distance
 from dpa.ranking.agreement import rank_correlation, same_order
 from dpa.report.statistics import Interval, summary
 from dpa.report.studies import plot_sensitivity
@@ -45,7 +45,7 @@ def measure_scene(each: Rolled, distances: dict[str, Distance]) -> dict[str, Any
         ranking = distance(each.scene, each.trajectories, each.controlled)
         found["seconds"][name] = time.process_time() - start
         found["distance"][name] = ranking.distance.tolist()
-        found["distance"].setdefault(ADE, ranking.ade.tolist())
+    found["distance"][ADE] = DisplacementDistance()(each.scene, each.trajectories, each.controlled).ade.tolist()
     return found
 
 

@@ -72,7 +72,8 @@ def spreads(rollouts: Iterable[Rolled], names: Sequence[str]) -> list[Spread]:
         raise ValueError("no agent-step of these scenes has a valid log, so there is nothing to measure; take others.")
     square = total / count
     paper, normalised = (
-        share / share.sum() for share in (feature_weights(names, weights) * square for weights in (None, "normalised"))
+        share / share.sum().clamp(min=torch.finfo(share.dtype).tiny)
+        for share in (feature_weights(names, weights) * square for weights in (None, "normalised"))
     )
     columns = (square.sqrt().tolist(), paper.tolist(), normalised.tolist())
     return [Spread(*row) for row in zip(names, *columns, strict=True)]

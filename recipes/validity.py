@@ -17,7 +17,7 @@ import numpy as np
 from omegaconf import DictConfig
 from torch import Tensor
 
-from dpa.ranking import Distance
+from dpa.ranking import DisplacementDistance, Distance
 from dpa.ranking.agreement import rank_correlation
 from dpa.realism import RealismConfig, realism_of_groups
 from dpa.report.statistics import Interval, paired_bootstrap, summary
@@ -62,7 +62,7 @@ def measure_scene(
     """
     rankings = {name: distance(each.scene, each.trajectories, each.controlled) for name, distance in distances.items()}
     values = {name: ranking.distance for name, ranking in rankings.items()}
-    values[ADE] = next(iter(rankings.values())).ade
+    values[ADE] = DisplacementDistance()(each.scene, each.trajectories, each.controlled).ade
     groups = {name: windows(value, window, stride) for name, value in values.items()}
     groups["random"] = random_groups(each, window, seed, "validity")
     flat = [group for each_group in groups.values() for group in each_group]
@@ -101,7 +101,7 @@ def summarise(measured: dict[str, list[dict]]) -> dict[str, dict[str, Any]]:
         distance, score = (
             np.array([[scene[name][key] for scene in row] for row in rows]) for key in ("distance", "realism")
         )
-        half = distance.shape[-1] // 2 + 1
+        half = max(2, (distance.shape[-1] + 1) // 2)
         gain = score - random[..., None]
         relative = distance / np.maximum(distance.mean(-1, keepdims=True), np.finfo(float).tiny)
         found[name] = {
@@ -153,6 +153,11 @@ def main(cfg: DictConfig) -> None:
         raise ValueError(
             f"window and stride must be 1 or more and two windows must fit into num_rollouts, got window={cfg.window}, "
             f"stride={cfg.stride} and num_rollouts={cfg.num_rollouts}; say num_rollouts={cfg.window + cfg.stride}."
+        )
+    if left := (cfg.num_rollouts - cfg.window) % cfg.stride:
+        raise ValueError(
+            f"the farthest {left} of num_rollouts={cfg.num_rollouts} are in no window: window={cfg.window} moves by "
+            f"stride={cfg.stride}; say num_rollouts={cfg.num_rollouts - left}."
         )
     distances = distances_of(cfg.rankings, "rankings")
     if not distances:

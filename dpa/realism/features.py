@@ -161,7 +161,10 @@ def _nearest_object(tracks: Tracks, rounding: float) -> Tensor:
 
 def _time_to_collision(tracks: Tracks, config: RealismConfig) -> Tensor:
     """Time until evaluated agents reach their leaders at present speeds (realism.md 3.2) -> ``[C, E, T]`` [s]."""
-    speed = _speed(tracks.position[..., :2], config.differences)[..., tracks.scored]
+    known = tracks.position[..., :2]
+    if Quirk.INVALID_AT_ORIGIN not in config.quirks:
+        known = known.where(tracks.valid[..., None], torch.nan)
+    speed = _speed(known, config.differences)[..., tracks.scored]
     position, heading = tracks.position[:, :, tracks.scored, :2], tracks.heading[:, :, tracks.scored]
     valid = tracks.valid[:, :, tracks.scored]
     return time_to_collision(

@@ -187,9 +187,10 @@ def scene_from_arrays(arrays: dict[str, np.ndarray], name: str) -> Scene:
 
     Args:
         arrays: tracks ``x, y, z, heading, length, width, height, vx, vy, valid [N, 91]``, ``object_id`` and
-            ``object_type [N]``; ``sdc_track_index``, ``tracks_to_predict``, ``scenario_id``; map features as
-            ``KIND_xyz [n, 3]`` with offsets ``KIND_ptr``, ``KIND_id`` and, for lanes, lines and edges, ``KIND_type``;
-            lights as ``tl_ptr [92]``, ``tl_lane_id``, ``tl_state``, ``tl_stop_point``.
+            ``object_type [N]``; ``sdc_track_index``, ``tracks_to_predict``, ``scenario_id`` and
+            ``current_time_index``, which is 10; map features as ``KIND_xyz [n, 3]`` with offsets ``KIND_ptr``,
+            ``KIND_id`` and, for lanes, lines and edges, ``KIND_type``; lights as ``tl_ptr [92]``, ``tl_lane_id``,
+            ``tl_state``, ``tl_stop_point``.
         name: what errors call them.
 
     Raises:

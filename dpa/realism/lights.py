@@ -37,4 +37,5 @@ def red_light_violation(scene: Scene, position: Tensor, valid: Tensor, quirks: S
     red = torch.isin(state, torch.tensor(RED_STATES, device=state.device))[:, 1:]
     if Quirk.ABSENT_STOP_AT_ORIGIN not in quirks:
         red = red & (state != LightState.ABSENT)[:, :-1]
-    return crosses_red(lanes, scene.lights.lane_id, red, stop, position, valid)
+    crossed = crosses_red(lanes, scene.lights.lane_id, red, stop, position, valid)
+    return crossed if Quirk.INVALID_AT_ORIGIN in quirks else crossed & valid[..., :-1]

@@ -239,6 +239,7 @@ def _batches(comparisons: list[Comparison], budget: float) -> Iterator[list[Comp
 def _score(measured: Features, config: RealismConfig, features: bool) -> RealismResult:
     likelihood = {**continuous_likelihoods(measured, config), **indicator_likelihoods(measured, config)}
     weights, displacement = config.weights, measured.displacement
+    displacement = displacement[:, ~displacement.isnan().any(0)]  # without history, an agent may have no step at all
     return RealismResult(
         realism=sum(weights[name] * value for name, value in likelihood.items()),
         likelihood=likelihood,

@@ -29,6 +29,8 @@ from envs.progress import progress
 STANDARD_ROLLOUTS = 32
 BAD_INPUT_STATUS = 2
 RESAMPLES = 9_999
+DRAWN = 10_000_000
+"""Scenarios that are drawn at a time, over all resamples: 160 MB."""
 
 
 def score(
@@ -86,7 +88,12 @@ def interval(values: Sequence[float]) -> list[float] | None:
     if len(set(values)) == 1:
         return [values[0], values[0]]
     draws = bootstrap(
-        (np.asarray(values),), np.mean, n_resamples=RESAMPLES, method="percentile", rng=np.random.default_rng(0)
+        (np.asarray(values),),
+        np.mean,
+        n_resamples=RESAMPLES,
+        batch=max(1, DRAWN // len(values)),
+        method="percentile",
+        rng=np.random.default_rng(0),
     )
     return [float(bound) for bound in draws.confidence_interval]
 

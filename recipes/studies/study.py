@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from dpa.policy import ContextOptions, Decoding, MotionLM
 from dpa.ranking import Distance
 from dpa.report.statistics import Interval, summary
 from dpa.rollout import make_collector
+from dpa.training.checkpoint import load_policy
 from envs.files import write_json
 from envs.progress import progress
 from envs.seeding import make_generator
@@ -53,7 +54,14 @@ def study(cfg: DictConfig, scenes: SceneStore, measure: Measure, decided_by: dic
         ValueError: no policy is given.
     """
     policies = policies_of(cfg)
+    check_readable(policies)
     return {name: study_policy(cfg, scenes, path, measure, decided_by, name) for name, path in policies.items()}
+
+
+def check_readable(policies: Mapping[str, Path]) -> None:
+    """Read every policy once, so that a slip in the last path is told before the hours of the first."""
+    for path in policies.values():
+        load_policy(path)
 
 
 def study_policy(

@@ -62,6 +62,12 @@ def test_agents_that_the_log_replays_are_not_measured() -> None:
     assert row.spread == pytest.approx(3.0, abs=1e-3)
 
 
+def test_features_that_never_differ_have_no_share() -> None:
+    scene = straight_road(1, speed=10.0)
+    rolled = Rolled(0, scene, log_trajectory(scene, 80)[None], torch.tensor([True]))
+    assert [(row.paper, row.normalised) for row in spreads([rolled], ["speed", "effort"])] == [(0, 0), (0, 0)]
+
+
 def test_only_valid_agent_steps_count_and_shares_follow_the_weights() -> None:
     scene = straight_road(1, speed=10.0)
     scene.agents.valid[0, 50:] = False

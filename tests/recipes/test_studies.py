@@ -19,11 +19,14 @@ from tensorboard.backend.event_processing.plugin_event_accumulator import EventA
 from dpa.realism import realism
 from dpa.realism.config import FOLDER
 from dpa.report.statistics import Interval
+from dpa.tokens import VerletTokenizer
 from dpa.training.loggers import read_curve
+from envs.scene import CURRENT_STEP
+from envs.sources.synthetic import straight_road
 from recipes import validity
 from recipes.common.cli import CONFIG
 from recipes.common.models import build_policy, policy_config, write_policy
-from recipes.ladder import BESIDES, table
+from recipes.ladder import BESIDES, table, tokenized_log
 from recipes.sensitivity import Variants
 from recipes.sensitivity import summarise as summarise_variants
 from recipes.studies.tables import StudyTable, tell
@@ -158,6 +161,7 @@ def test_a_finished_study_is_read_back_and_a_killed_one_goes_on(
             "two windows must fit into num_rollouts, got window=9, stride=8 and num_rollouts=8; say num_rollouts=17",
         ),
         ("validity", ["window=8", "stride=1"], "two windows must fit .* say num_rollouts=9"),
+        ("validity", ["window=4", "stride=3"], "farthest . of num_rollouts=. are in no window: .* say num_rollouts="),
         ("validity", ["policies=[]"], "policies=.. names no policy"),
         ("validity", ["+rankings.ade={}"], "rankings.ade: ade and random stand for displacement and chance"),
         ("validity", ["logger.backend=mlflow"], "logger.backend must be csv, wandb or tensorboard, got 'mlflow'"),
@@ -225,6 +229,15 @@ def test_sensitivity_ranks_the_same_rollouts_by_every_variant(
 
 
 # --- ladder -----------------------------------------------------------------------------------------------------------
+def test_the_log_through_tokens_starts_from_what_a_policy_sees() -> None:
+    scene = straight_road(1, speed=15.0)
+    scene.agents.valid[0, :8] = False
+    scene.agents.position[0, :8] = 0.0
+    (driven,) = tokenized_log(VerletTokenizer())(scene, 1, torch.Generator())
+    log = scene.agents.position[0, CURRENT_STEP + 1 :, :2]
+    assert (driven[0, :, :2] - log).norm(dim=-1).max() < 0.5
+
+
 def test_scenes_that_some_rung_has_no_realism_for_count_for_none() -> None:
     def scores(*realism: float | None) -> dict:
         return {"2024": {"realism": list(realism), **{name: [0.1, 0.2, 0.3] for name in BESIDES}}}

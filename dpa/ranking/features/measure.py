@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from dpa.ranking.features import more  # noqa: F401 - registers its features
 from dpa.ranking.features.paper import FEATURE_SETS
-from dpa.ranking.features.registry import CONTEXT, FEATURES, Motion
+from dpa.ranking.features.registry import CONTEXT, FEATURES, Motion, check_clip
 from envs.scene import CURRENT_STEP, Scene
 
 WEIGHTS = ("paper", "normalised")
@@ -20,7 +21,7 @@ def feature_names(features: str | Sequence[str]) -> tuple[str, ...]:
     """Names of the features of a set, or the names themselves, checked.
 
     Raises:
-        ValueError: an unknown set or name, or none at all.
+        ValueError: an unknown set or name, one that comes twice, or none at all.
 
     Examples:
         >>> feature_names("full")
@@ -35,6 +36,8 @@ def feature_names(features: str | Sequence[str]) -> tuple[str, ...]:
     unknown = [name for name in features if name not in FEATURES]
     if unknown or not features:
         raise ValueError(f"unknown features {unknown} in {list(features)}; choose among {sorted(FEATURES)}.")
+    if len(set(features)) < len(features):
+        raise ValueError(f"a feature comes twice in {list(features)}; name each once, and weigh it with weights.")
     return tuple(features)
 
 
@@ -48,7 +51,7 @@ def feature_weights(names: Sequence[str], weights: str | Mapping[str, float] | N
             by name, and the paper's for what it does not name.
 
     Raises:
-        ValueError: an unknown way to weigh, or a weight for a feature that is not among the names.
+        ValueError: an unknown way to weigh, a negative weight, or one for a feature that is not among the names.
 
     Examples:
         >>> feature_weights(feature_names("full"), {"speed": 3.0})
@@ -63,6 +66,9 @@ def feature_weights(names: Sequence[str], weights: str | Mapping[str, float] | N
         power = 2 if weights == "normalised" else 0
         return torch.tensor([FEATURES[name].weight / FEATURES[name].spread ** power for name in names])
     given = _only_among(names, weights, "weights")
+    for name, weight in given.items():
+        if not (weight >= 0 and math.isfinite(weight)):
+            raise ValueError(f"the weight of feature {name!r} must be a number of 0 or more, got {weight}.")
     return torch.tensor([given.get(name, FEATURES[name].weight) for name in names])
 
 
@@ -72,13 +78,16 @@ def feature_clips(
     """The registered clip ranges of some features, or others where given by name.
 
     Raises:
-        ValueError: a range is given for a feature that is not among the names.
+        ValueError: a range is empty, or given for a feature that is not among the names.
 
     Examples:
         >>> feature_clips(["speed", "effort"], {"effort": (0.0, 8.0)})
         {'speed': (0.0, 25.0), 'effort': (0.0, 8.0)}
     """
-    return {name: FEATURES[name].clip for name in names} | _only_among(names, clips, "clips")
+    given = _only_among(names, clips, "clips")
+    for name, clip in given.items():
+        check_clip(name, clip)
+    return {name: FEATURES[name].clip for name in names} | given
 
 
 def log_trajectory(scene: Scene, steps: int) -> Tensor:

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from dpa.ranking.features.registry import Motion, register
+from dpa.ranking.features.registry import CONTEXT, Motion, register
 from envs.geometry.edges import RoadEdges
 from envs.geometry.following import LONGEST_TIME, time_to_collision
 from envs.geometry.frames import wrap_angle
@@ -20,7 +20,8 @@ from envs.signals import SignalMap
 def red_light(motion: Motion) -> Tensor:
     """1 at the step at which the agent passes the stop point of its lane while the light is red (realism.md 4.2).
 
-    Nobody does where a scene has no lights or no surface streets.
+    Where not every step is measured, at the first one measured from then on. Nobody does where a scene has no lights or
+    no surface streets.
     """
     road = SignalMap(motion.scene, motion.poses.device)
     if road.lanes is None:
@@ -29,7 +30,9 @@ def red_light(motion: Motion) -> Tensor:
     span = motion.logged
     red, stop = red[:, span.start : span.stop - 1], stop[:, span]
     position, valid = motion.poses[:, motion.ego, :, :2], motion.valid[motion.ego].expand(motion.shape[0], -1, -1)
-    return crosses_red(road.lanes, lane_id, red, stop, position, valid)[:, :, motion.steps - 1].float()
+    crossed = crosses_red(road.lanes, lane_id, red, stop, position, valid) & valid[..., :-1]
+    first, last, stride = CONTEXT - 1, int(motion.steps[-1]), int(motion.steps[0]) - CONTEXT + 1
+    return crossed[..., first:last].unflatten(-1, (-1, stride)).any(-1).float()
 
 
 @register("lane_deviation", unit="m", clip=(0.0, 10.0), weight=1.0, spread=0.97)

@@ -93,6 +93,12 @@ FEATURES: dict[str, Feature] = {}
 """Every feature by name; :func:`register` adds one."""
 
 
+def check_clip(name: str, clip: tuple[float, float]) -> None:
+    """Refuse a range that tells nothing apart."""
+    if not clip[0] < clip[1]:
+        raise ValueError(f"the clip range of feature {name!r} must be (low, high) with low < high, got {clip}.")
+
+
 def register(
     name: str, *, unit: str, clip: tuple[float, float], weight: float, spread: float, past: int = 0
 ) -> Callable[[Callable[[Motion], Tensor]], Callable[[Motion], Tensor]]:
@@ -111,8 +117,7 @@ def register(
     """
     if name in FEATURES:
         raise ValueError(f"feature {name!r} is registered already; choose another name.")
-    if not clip[0] < clip[1]:
-        raise ValueError(f"the clip range of feature {name!r} must be (low, high) with low < high, got {clip}.")
+    check_clip(name, clip)
     if not spread > 0:
         raise ValueError(f"the spread of feature {name!r} must be above 0, got {spread}; recipes.spread measures it.")
     if not 0 <= past <= CONTEXT:

@@ -96,7 +96,10 @@ class Sinkhorn:
             done = done | (error <= self.tolerance)
             if bool(done.all()):
                 break
-        return Dense(pairs * (u[:, :, None] + v[:, None] - cost / epsilon).exp(), error)
+        coupling = pairs * (u[:, :, None] + v[:, None] - cost / epsilon).exp()
+        return Dense(
+            coupling.where(pairs > 0, 0.0), error
+        )  # steps that do not count have no cost, and potentials at will
 
 
 def _potential(scaled: Tensor, other: Tensor, log_mass: Tensor, dim: int) -> Tensor:

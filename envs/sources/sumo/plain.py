@@ -1,7 +1,8 @@
 """Road networks drawn by hand: nodes, edges and connections that ``netconvert`` turns into a network.
 
-``netgenerate`` knows grids, spiders and trees only. Everything else is drawn here: a maker (:mod:`sumo_motorway`,
-:mod:`sumo_roundabout`) fills :class:`PlainRoads`, and :func:`convert_roads` writes it down.
+``netgenerate`` knows grids, spiders and trees only. Everything else is drawn here: a maker
+(:mod:`~envs.sources.sumo.motorway`, :mod:`~envs.sources.sumo.roundabout`) fills :class:`PlainRoads`, and
+:func:`convert_roads` writes it down.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -10,6 +12,7 @@ from torch import Tensor
 
 from dpa.ranking.features import (
     FEATURES,
+    feature_clips,
     feature_names,
     feature_weights,
     log_trajectory,
@@ -160,7 +163,9 @@ def test_a_red_light_is_violated_at_the_step_that_passes_its_stop_point() -> Non
     passes = (x[:-1] < stop) & (x[1:] > stop)
     assert valid.all() and passes.sum() == 1
     assert torch.equal(phi["red_light"][0], passes.float())
-    assert torch.equal(of_log(scene, "red_light", stride=5)[0]["red_light"], phi["red_light"][:, 4::5])
+    within = phi["red_light"].unflatten(1, (-1, 5)).amax(-1)
+    assert within.sum() == 1 and not phi["red_light"][:, 4::5].any(), "between two measured steps"
+    assert torch.equal(of_log(scene, "red_light", stride=5)[0]["red_light"], within)
     scene.lights.state[:] = LightState.GO
     assert not of_log(scene, "red_light")[0]["red_light"].any()
 
@@ -267,3 +272,10 @@ def test_bad_options_are_refused_with_the_value() -> None:
         register("jerk", unit="m/s^3", clip=(0, 1), weight=1.0, spread=0.0)
     with pytest.raises(ValueError, match="'equal'.*'normalised'"):
         feature_weights(["speed"], "equal")
+    with pytest.raises(ValueError, match="comes twice in .*'speed', 'speed'"):
+        feature_names(["speed", "speed"])
+    for weight in (-1.0, math.nan, math.inf):
+        with pytest.raises(ValueError, match=f"'speed' must be a number of 0 or more, got {weight}"):
+            feature_weights(["speed"], {"speed": weight})
+    with pytest.raises(ValueError, match=r"'speed' must be \(low, high\) with low < high, got \(25, 0\)"):
+        feature_clips(["speed"], {"speed": (25, 0)})

@@ -238,6 +238,15 @@ def test_a_problem_of_sinkhorn_does_not_depend_on_those_beside_it() -> None:
     torch.testing.assert_close(together, alone, rtol=1e-5, atol=0)
 
 
+def test_a_coupling_by_sinkhorn_is_0_where_nothing_counts_however_far_points_are_from_the_origin() -> None:
+    x, y = (cloud.float() + torch.tensor([0.0, -5.0, 30.0, 0.5, 20.0]) for cloud in clouds(5, 2))
+    valid = always()
+    valid[..., 8:12] = False
+    got = transport_cost(x, y, valid, valid, WEIGHTS, method="sinkhorn", coupling=True)
+    torch.testing.assert_close(got.coupling.sum((-1, -2)), torch.ones(2))
+    assert not got.coupling[:, 8:12].any() and not got.coupling[..., 8:12].any()
+
+
 def test_identical_single_points_are_at_zero_by_sinkhorn() -> None:
     x = torch.ones(1, 5)
     got = transport_cost(x, x, always(1), always(1), WEIGHTS, method="sinkhorn")

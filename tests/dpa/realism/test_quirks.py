@@ -70,6 +70,45 @@ def test_invalid_at_origin() -> None:
     assert math.isnan(first_acceleration(without(Quirk.INVALID_AT_ORIGIN)))
 
 
+def test_a_speed_across_a_hole_of_the_log_reaches_no_leader_in_the_clean_metric() -> None:
+    # the follower is as fast as its leader; across the hole it seems to come from the origin of the world
+    scene = straight_road(num_vehicles=2, speed=10.0)
+    rollout = log_as_rollout(scene)
+    follower = int(scene.agents.position[:, CURRENT_STEP, 0].argmin())
+    scene.agents.valid[follower, 50] = False
+    scene.agents.position[follower, 50] = -torch.tensor([3000.0, 4000.0, 0.0])
+    scene.origin = torch.tensor([3000.0, 4000.0, 0.0], dtype=torch.float64)
+
+    def shortest(config: RealismConfig) -> float:
+        return measured(scene, rollout, config).values["time_to_collision"][0].min().item()
+
+    clean = without(Quirk.INVALID_AT_ORIGIN)
+    assert shortest(OFFICIAL) < 0.1 and shortest(clean) == 5.0
+    assert likelihood(scene, rollout, OFFICIAL, "time_to_collision") < 0.95
+    assert likelihood(scene, rollout, clean, "time_to_collision") > 0.95
+
+
+def test_nobody_crosses_a_red_light_from_the_origin_in_the_clean_metric() -> None:
+    scene = red_light(speed=8.5)
+    last = int(scene.agents.valid[0].nonzero()[-1])
+    scene.agents.valid[0, last - 1] = False
+    scene.agents.position[0, last - 1] = 0.0  # before the stop line, as the origin of the world may be
+    before = scene.agents.position[0, last, 0]
+    assert before > scene.lights.stop_point[0, last, 0]
+    official = frozenset(Quirk) - {Quirk.PLUS_FOR_MINUS, Quirk.LANES_TO_ORIGIN}
+    assert last - CURRENT_STEP - 1 in violations(scene, official)
+    assert last - CURRENT_STEP - 1 not in violations(scene, official - {Quirk.INVALID_AT_ORIGIN})
+
+
+def test_an_agent_without_a_logged_future_has_no_part_in_the_clean_displacement() -> None:
+    scene = straight_road(num_vehicles=3)
+    rollout = log_as_rollout(scene)
+    rollout[..., 1] += 1.0
+    scene.agents.valid[2, CURRENT_STEP + 1 :] = False
+    scored = realism(scene, rollout, without(Quirk.HISTORY_IN_ADE))
+    assert scored.min_ade == pytest.approx(1.0) and scored.ade == pytest.approx(1.0)
+
+
 def test_ends_unscored() -> None:
     # the first step is as fast as the rollouts, all others are not: it counts only in the clean metric
     scene = straight_road(num_vehicles=1, speed=11.0)
