@@ -35,8 +35,9 @@ def simulated_agents(scene: Scene, *, arrivals: bool = False, last_step: int = L
     """One uncollated scene with the agents of a simulation only.
 
     Those are the agents valid at the current step, in their order. Arrivals follow in their order: agents that are not
-    there at the current step but are logged by ``last_step``. Until they arrive their poses are carried back from the
-    first one at constant velocity, and are not valid.
+    there at the current step but are logged by ``last_step``. From the current step on every agent has poses: where the
+    log has none, before it arrives, in a hole or after it has left, they are carried back from the next logged one at
+    constant velocity or stay at the last one, and are not valid.
 
     Args:
         scene: an uncollated scene.
@@ -54,30 +55,30 @@ def simulated_agents(scene: Scene, *, arrivals: bool = False, last_step: int = L
     """
     agents = scene.agents
     present = agents.present.nonzero()[:, 0]
-    if not arrivals:
-        return select_agents(scene, present)
     arrive = (~agents.present & agents.valid[:, CURRENT_STEP + 1 : last_step + 1].any(-1)).nonzero()[:, 0]
-    scene = select_agents(scene, torch.cat((present, arrive)))
-    _carry_back(scene.agents, slice(len(present), None))
+    scene = select_agents(scene, torch.cat((present, arrive)) if arrivals else present)
+    _fill(scene.agents)
     return scene
 
 
-def _carry_back(agents: Agents, rows: slice) -> None:
-    """Write poses of arriving agents from the current step to their arrival, at constant velocity."""
-    valid = agents.valid[rows, CURRENT_STEP:]
-    if not len(valid):
-        return
-    steps = torch.arange(valid.shape[1], device=valid.device)
-    first = valid.int().argmax(-1)
-    before = (steps < first[:, None])[..., None]
-    at = (torch.arange(len(first), device=valid.device), CURRENT_STEP + first)
-    back = (first[:, None] - steps)[..., None] * STEP_SECONDS
+def _fill(agents: Agents) -> None:
+    """Write poses where the log has none from the current step on.
+
+    Before a logged step they are carried back from it at constant velocity and heading; after the last one they stay.
+    """
+    valid = agents.valid[:, CURRENT_STEP:]
+    steps, end = torch.arange(valid.shape[1], device=valid.device), valid.shape[1]
+    later = torch.where(valid, steps, end).flip(-1).cummin(-1).values.flip(-1)
+    earlier = torch.where(valid, steps, 0).cummax(-1).values
+    source = torch.where(later < end, later, earlier)
+    back = (source - steps).clamp(min=0)[..., None] * STEP_SECONDS
+    rows = torch.arange(len(valid), device=valid.device)[:, None]
+    position, velocity = agents.position[rows, CURRENT_STEP + source], agents.velocity[rows, CURRENT_STEP + source]
+    position[..., :2] -= back * velocity
+    heading = agents.heading[rows, CURRENT_STEP + source]
     # select_agents has copied these tensors, so nobody else sees the change
-    for value, rate in ((agents.position[rows], agents.velocity[rows][at]), (agents.heading[rows, :, None], None)):
-        held = value[at][:, None].expand(-1, len(steps), -1).clone()
-        if rate is not None:
-            held[..., :2] -= back * rate[:, None]
-        value[:, CURRENT_STEP:] = torch.where(before, held, value[:, CURRENT_STEP:])
+    for value, held in ((agents.position, position), (agents.heading[..., None], heading[..., None])):
+        value[:, CURRENT_STEP:] = torch.where(valid[..., None], value[:, CURRENT_STEP:], held)
 
 
 def largest_scene(scenes: SceneSource, *, arrivals: bool = False, last_step: int = LOG_STEPS - 1) -> int:

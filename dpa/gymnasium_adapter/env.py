@@ -45,7 +45,8 @@ class TrafficGym(gymnasium.Env[Observation, Any]):
 
     The reward is the weighted sum of signals, averaged over the controlled agents. An episode terminates when the SDC
     does something that ``terminate_on`` names, and is truncated at the horizon. ``info`` has ``scene_id``,
-    ``log_displacement`` (mean over controlled agents and decisions so far [m]) and, for each event among the signals,
+    ``log_displacement`` (mean over controlled agents and decisions so far [m],
+    0 where nothing is logged) and, for each event among the signals,
     ``<name>_rate``: the share of controlled agents that it has happened to.
 
     Args:

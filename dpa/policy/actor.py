@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Literal, get_args
 
 import torch
@@ -75,7 +76,8 @@ class MotionActor(TensorDictModuleBase):
 
     A rollout is decided by the scene's id, its number k among the scene's rollouts and the seed: not by the batch that
     it is part of, up to the rounding of the logits (about 1e-6), which can turn a draw that falls between two tokens.
-    When a rollout is begun again, it comes out anew.
+    When a rollout is begun again, or stands in a batch more than once, it comes out anew; an episode of a single
+    decision is not known from one that was tried out, and is the same until :meth:`set_seed`.
 
     Args:
         model: the distribution.
@@ -95,7 +97,7 @@ class MotionActor(TensorDictModuleBase):
         ValueError: an unknown precision.
 
     ``log_prob`` is that of the model itself, ``sampling_log_prob`` that of the distribution drawn from (0 for the most
-    probable token, which ``ExplorationType.DETERMINISTIC`` takes).
+    probable token, which ``ExplorationType.DETERMINISTIC`` and ``MODE`` take).
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -148,6 +150,7 @@ class MotionActor(TensorDictModuleBase):
         """``[B, A, V]`` of the decision at hand; adds its nodes to the cache."""
         recent, step = tensordict[keys.RECENT], tensordict[keys.STEP][:, 0]
         self._start(tensordict[keys.SCENE], step, recent.shape[:2])
+        self._check_contexts(tensordict, step == 0)
         controlled = tensordict[keys.CONTROLLED]
         last = torch.where((step[:, None] > 0) & controlled, self._last, self.model.no_token)
         valid = tensordict[keys.VALID]
@@ -182,9 +185,21 @@ class MotionActor(TensorDictModuleBase):
         # Padding depends on the scenes of a batch, so a change of some encodes all: rare, and cheap beside the episode.
         self._scenes[fresh] = scene.view(-1, self.num_rollouts)[:, 0][fresh]
         context = collate_contexts([self.contexts[i] for i in self._scenes.tolist()]).to(step.device)
+        self._context = pad_context(context, shape[1])
         with self._autocast(step.device):
-            self._memory = self.model.encode(pad_context(context, shape[1]))
+            self._memory = self.model.encode(self._context)
         self._draw_noise(begins.nonzero()[:, 0].tolist(), scene.tolist())
+
+    def _check_contexts(self, tensordict: TensorDictBase, begins: Tensor) -> None:
+        """Refuse contexts of other agents than the environment's."""
+        group = begins.nonzero()[:, 0] // self.num_rollouts
+        for name, key in (("kind", keys.KIND), ("valid", keys.VALID), ("recent", keys.RECENT)):
+            mine, theirs = getattr(self._context, name)[group], tensordict[key][begins]
+            if not torch.allclose(mine.float(), theirs.float(), atol=1e-3):
+                raise ValueError(
+                    f"the contexts of the policy and the environment differ in {name!r} of the agents of a scene; give "
+                    "both the same scenes, arrivals, decision_steps and horizon."
+                )
 
     def _allocate(self, shape: torch.Size, device: torch.device) -> None:
         """Buffers for B rows of A agents; those of the episodes before serve again."""
@@ -204,10 +219,12 @@ class MotionActor(TensorDictModuleBase):
             self._begun[named] = self._begun.get(named, 0) + 1
 
     def _draw_noise(self, rows: list[int], scene: list[int]) -> None:
-        horizon = self.model.config.horizon
+        horizon, beside = self.model.config.horizon, Counter()
         for row in rows:
             rollout = self.first_rollout + row % self.num_rollouts
-            episode = self._begun.get((scene[row], rollout), 0)
+            named = (scene[row], rollout)
+            episode = self._begun.get(named, 0) + beside[named]
+            beside[named] += 1  # groups of one batch may show the same scene
             agents = len(self.contexts[scene[row]].kind)
             scene_id = self.contexts.scene_id(scene[row])
             self._noise[row, :, :agents] = rollout_noise(self.seed, scene_id, rollout, episode, (horizon, agents))
@@ -216,7 +233,7 @@ class MotionActor(TensorDictModuleBase):
     # --- sampling ---------------------------------------------------------------------------------------------------
     def _sample(self, logits: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
         """Tokens ``[B, A]`` and the log-probabilities by which they were drawn."""
-        if exploration_type() is ExplorationType.DETERMINISTIC:
+        if exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE):
             token = logits.argmax(-1)
             return token, torch.zeros_like(logits[..., 0])
         log_probs = self.decoding.log_probs(logits)

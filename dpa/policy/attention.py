@@ -54,7 +54,7 @@ class RelativeAttention(nn.Module):
     Args:
         width: channels of a token.
         heads: H; ``width`` is a multiple of it.
-        gaze: width of a head's gaze at the start of training [m], from the narrowest head to the widest.
+        gaze: width of a head's gaze at the start of training [m], of the first and of the last head.
 
     Raises:
         ValueError: ``width`` is no multiple of ``heads``.

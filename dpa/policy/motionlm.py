@@ -106,7 +106,7 @@ class MotionLM(nn.Module):
         each = _Each(rollouts)
         flat, kind = tokens.flatten(0, 1), each(context.kind)
         controlled = each(context.controlled)
-        valid = node_validity(context, token_valid.expand_as(tokens)).flatten(0, 1)
+        valid = node_validity(context, token_valid.expand_as(tokens), self.tokenizer.steps).flatten(0, 1)
         recent = self._recent(context, flat, each)
         last = torch.nn.functional.pad(flat[..., :-1], (1, 0), value=self.no_token)
         last = torch.where(controlled[..., None], last, self.no_token)
@@ -146,20 +146,20 @@ class _Each:
         return value.repeat_interleave(self.rollouts, 0)
 
 
-def node_validity(context: SceneContext, token_valid: Tensor) -> Tensor:
+def node_validity(context: SceneContext, token_valid: Tensor, steps: int) -> Tensor:
     """Which nodes others may look at.
 
     Args:
         context: of batch size ``[S]``.
-        token_valid: ``[S, M, A, T]`` bool.
+        token_valid: ``[S, M, A, T]`` bool, of the first T decisions.
+        steps: F, of a decision.
 
     Returns:
         ``[S, M, A, T]`` bool: a controlled agent counts while the tokens before are valid, a replayed one, which may
         arrive later, while it is logged.
     """
-    horizon = token_valid.shape[-1]
     present = context.valid[:, None, :, None].expand(*token_valid.shape[:-1], 1)
-    steps = context.logged_valid.shape[-1] // max(horizon, 1)
-    ends = context.logged_valid.unflatten(-1, (-1, steps))[..., -1][:, None].expand_as(token_valid)
+    ends = context.logged_valid[..., steps - 1 :: steps][..., : token_valid.shape[-1]]
+    ends = ends[:, None].expand_as(token_valid)
     later = torch.where(context.controlled[:, None, :, None], token_valid & present, ends)[..., :-1]
     return torch.cat((present, later), -1)

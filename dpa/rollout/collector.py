@@ -20,7 +20,8 @@ from dpa.policy.sampling import Decoding
 from dpa.rollout.crew import Crew, Outcome, Workers, hire
 from dpa.rollout.job import PostProcess, RolloutJob
 from dpa.rollout.plan import GIB, RolloutTask, bytes_per_row, plan_tasks
-from envs.scene import SceneSource
+from envs.participants import simulated_agents
+from envs.scene import CURRENT_STEP, SceneSource
 
 MOST_LOSSES = 3
 """Workers that one task may cost before it is given up."""
@@ -230,7 +231,7 @@ def make_collector(
         precision=precision,
         compile=compile,
     )
-    tasks = plan_tasks(agents_of(scenes, indices), num_rollouts, rows_within(memory, model, options), done)
+    tasks = plan_tasks(agents_of(scenes, indices, options), num_rollouts, rows_within(memory, model, options), done)
     return RolloutCollector(job, tasks, workers)
 
 
@@ -246,8 +247,12 @@ def rows_within(memory: float, model: MotionLM, options: ContextOptions) -> int:
     return rows
 
 
-def agents_of(scenes: SceneSource, indices: Sequence[int] | None) -> dict[int, int]:
-    """Present agents of some scenes (all by default) by index; a store knows them without loading a scene."""
+def agents_of(scenes: SceneSource, indices: Sequence[int] | None, options: ContextOptions) -> dict[int, int]:
+    """Simulated agents of some scenes (all by default) by index; without arrivals a store knows them by itself."""
     wanted = range(len(scenes)) if indices is None else indices
-    known = getattr(scenes, "num_agents", None)
-    return {i: int(known[i] if known is not None else scenes[i].agents.present.sum()) for i in wanted}
+    known = None if options.arrivals else getattr(scenes, "num_agents", None)
+    if known is not None:
+        return {i: int(known[i]) for i in wanted}
+    last = CURRENT_STEP + options.decision_steps * options.horizon
+    cast = {"arrivals": options.arrivals, "last_step": last}
+    return {i: len(simulated_agents(scenes[i], **cast).agents.kind) for i in wanted}

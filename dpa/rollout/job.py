@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -99,7 +100,7 @@ class RolloutWorker:
 
     def __init__(self, job: RolloutJob) -> None:
         self.job = job
-        self.model = job.model.to(job.device).eval()
+        self.model = copy.deepcopy(job.model).to(job.device).eval()  # the caller's may be in training, or elsewhere
 
     def update(self, weights: Mapping[str, Tensor] | None, seed: int) -> None:
         """Take over other weights (None keeps those at hand) and a seed."""
@@ -117,7 +118,10 @@ class RolloutWorker:
         batch = pieces[0] if len(pieces) == 1 else torch.cat(together, 1).flatten(0, 1)
         if self.job.make_postproc is not None:
             batch = self.job.make_postproc(part)(batch)
-        batch[keys.SCENE] = torch.tensor(task.scenes, device=batch.device)[batch[keys.SCENE]]
+        in_source = torch.tensor(task.scenes, device=batch.device)
+        for key in (keys.SCENE, ("next", keys.SCENE)):
+            if key in batch.keys(include_nested=True):
+                batch[key] = in_source[batch[key]]
         return batch
 
     def _piece(self, part: Subset, contexts: Contexts, piece: range) -> TensorDictBase:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -39,7 +40,7 @@ class RayCrew:
         self._needs = f"{needs['num_cpus']} CPUs and {needs['num_gpus']} GPUs"
         self._hire = self._ray.remote(**needs, max_restarts=0)(_Hand).remote
         self._threads = workers.threads
-        self._job = self._ray.put(replace(job, model=job.model.cpu(), device=str(job.device)))
+        self._job = self._ray.put(replace(job, model=copy.deepcopy(job.model).cpu(), device=str(job.device)))
         self._latest: tuple[Any, int] = (None, job.seed)
         self._hands = [self._start() for _ in range(self.size)]
         self._running: dict[Any, int] = {}

@@ -196,5 +196,7 @@ def finished(path: Path, decided_by: dict[str, Any]) -> dict[str, Any] | None:
         raise ValueError(f"{path} is no result of this recipe ({error}); remove it, or name another file.") from None
     differ = differences(options, decided_by)
     if differ:
-        raise ValueError(f"{path} was written with other options ({differ}); name another output folder, or remove it.")
+        raise ValueError(
+            f"{path} was written with other options ({differ}); remove it, or name another file or folder."
+        )
     return content

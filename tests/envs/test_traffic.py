@@ -198,12 +198,36 @@ def test_the_rest_follow_the_log_and_leave_with_it() -> None:
     rollout = env.rollout(16, Stand())
     replayed = [0, 2, 3, 4]
     poses = rollout["next", *keys.RECENT][0, :, :, 1:].movedim(0, 1).flatten(1, 2)
-    assert torch.equal(poses[replayed], scene.agents.poses[replayed, CURRENT_STEP + 1 :])
+    expected = scene.agents.poses[:, CURRENT_STEP + 1 :].clone()
+    expected[3, 30 - CURRENT_STEP - 1 :] = scene.agents.poses[3, 29]  # it stays where it left, and is not at the origin
+    assert torch.equal(poses[replayed], expected[replayed])
     ends = scene.agents.valid[:, CURRENT_STEP + 5 :: 5].clone()
     assert ends.shape[1] == 16 and not ends[3, 4:].any(), "agent 3 leaves the log after 2 s"
     ends[[1, 5]] = True
     assert torch.equal(rollout["next", *keys.VALID][0], ends.T)
     assert (rollout["next", *keys.REWARD][0, :, replayed] == 0).all()
+
+
+def test_an_agent_in_a_hole_of_its_log_moves_on_and_is_not_there() -> None:
+    scene = crowd()
+    hole = slice(20, 31)
+    scene.agents.position[3, :, 0] = 30.0 + 0.1 * torch.arange(91)
+    scene.agents.valid[3] = True
+    scene.agents.position[3, hole], scene.agents.valid[3, hole] = 0.0, False
+    scene.agents.velocity[3] = torch.tensor([1.0, 0.0])
+    rollout = TrafficEnv([scene], max_controlled=2).rollout(16, Stand())
+    x = rollout["next", *keys.RECENT][0, :, 3, 1:, 0].flatten()
+    torch.testing.assert_close(x, 30.0 + 0.1 * torch.arange(CURRENT_STEP + 1, 91), atol=1e-4, rtol=0)
+    assert rollout["next", *keys.VALID][0, :, 3].tolist() == [True, False, False, False, *[True] * 12]
+
+
+def test_what_lies_where_the_log_has_nothing_does_not_move_anybody() -> None:
+    scene, other = crowd(), crowd()
+    other.agents.position[3, 30:] = torch.tensor([-500.0, 0.0, 0.0])
+    poses, moved = (
+        TrafficEnv([each], max_controlled=2).rollout(16, Stand())["next", *keys.RECENT] for each in (scene, other)
+    )
+    assert torch.equal(poses, moved)
 
 
 def test_more_agents_than_the_limit_of_the_challenge() -> None:

@@ -257,6 +257,33 @@ def test_another_number_of_rollouts_than_the_environment_has_is_refused(model: M
         MotionActor(model, Contexts(scenes), num_rollouts=2)(env.reset())
 
 
+def test_groups_of_one_batch_that_show_one_scene_differ(model: MotionLM) -> None:
+    scenes = [straight_road(3)]
+    env = TransformedEnv(TrafficEnv(scenes, num_scenes=2, num_rollouts=2), TokenAction(model.tokenizer))
+    actor = MotionActor(model, Contexts(scenes), num_rollouts=2)
+    tokens = env.rollout(16, actor)[keys.TOKEN].flatten(1)
+    assert len(tokens.unique(dim=0)) == 4
+    again = env.rollout(16, actor)[keys.TOKEN].flatten(1)
+    assert len(torch.cat((tokens, again)).unique(dim=0)) == 8
+
+
+def test_the_mode_is_the_most_probable_token(model: MotionLM, scenes: list[Scene]) -> None:
+    env, actor = drive(model, scenes)
+    with set_exploration_type(ExplorationType.MODE):
+        mode = env.rollout(2, actor)[keys.TOKEN]
+    env, actor = drive(model, scenes)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert torch.equal(mode, env.rollout(2, actor)[keys.TOKEN])
+
+
+def test_contexts_of_other_agents_are_refused(model: MotionLM) -> None:
+    scene = straight_road(3)
+    scene.agents.valid[1, :30] = False
+    env = TransformedEnv(TrafficEnv([scene], arrivals=True), TokenAction(model.tokenizer))
+    with pytest.raises(ValueError, match="differ in 'kind' .* give both the same scenes, arrivals"):
+        env.rollout(1, MotionActor(model, Contexts([scene])))
+
+
 def test_contexts_of_other_scenes_are_refused(model: MotionLM) -> None:
     env = TransformedEnv(TrafficEnv([straight_road(1)]), TokenAction(model.tokenizer))
     with pytest.raises(ValueError, match="contexts hold 3 agents and the environment 1"):

@@ -141,6 +141,17 @@ def test_a_shorter_episode_is_the_beginning_of_a_longer_one(
     torch.testing.assert_close(short, logits[..., :horizon, :], **CLOSE)
 
 
+def test_fewer_tokens_than_the_context_has_decisions_see_the_log_at_the_same_times(
+    model: MotionLM, scene: Callable[..., Scene]
+) -> None:
+    road = scene()
+    road.agents.valid[1, 25:] = False
+    context = make_context(road, ContextOptions(max_controlled=1))
+    tokens = draw(3)
+    whole, part = logits_of(model, context, tokens), logits_of(model, context, tokens[..., :8])
+    torch.testing.assert_close(part, whole[..., :8, :], **CLOSE)
+
+
 def test_everything_that_trains_gets_a_gradient(model: MotionLM, scene: Callable[..., Scene]) -> None:
     with torch.enable_grad():
         logits_of(model, make_context(scene()), draw(3)).log_softmax(-1)[..., 0].sum().backward()

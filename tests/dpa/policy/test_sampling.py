@@ -59,6 +59,14 @@ def test_tokens_of_equal_probability_are_kept_or_cut_together(decoding: Decoding
     torch.testing.assert_close(decoding.log_probs(probs.log()).exp(), kept)
 
 
+def test_the_cut_distribution_has_the_gradient_of_its_own_softmax() -> None:
+    logits = torch.tensor([2.0, 1.0, 0.5, -1.0], requires_grad=True)
+    Decoding(top_p=0.9).log_probs(logits)[0].backward()
+    kept = logits.detach()[:3].requires_grad_()
+    kept.log_softmax(-1)[0].backward()
+    torch.testing.assert_close(logits.grad, torch.cat((kept.grad, torch.zeros(1))))
+
+
 def test_draws_have_the_frequencies_of_the_distribution() -> None:
     probs = torch.tensor([0.1, 0.0, 0.6, 0.3, 0.0])
     drawn = draw(probs.log().expand(100_000, -1), torch.rand(100_000, generator=torch.Generator().manual_seed(0)))

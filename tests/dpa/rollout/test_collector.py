@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import signal
 from collections.abc import Callable, Iterable
@@ -20,10 +21,12 @@ from dpa.policy import ContextOptions, Decoding, MotionActor, MotionLM
 from dpa.policy.actor import Contexts
 from dpa.ranking.transform import RankRollouts
 from dpa.rollout import RolloutCollector, Workers, bytes_per_row, make_collector
+from dpa.rollout.collector import agents_of
 from dpa.rollout.plan import GIB
 from dpa.tokens import TokenAction
 from envs import keys
 from envs.scene import Scene
+from envs.sources.synthetic import straight_road
 from envs.traffic import TrafficEnv
 
 SIZES = (2, 1, 3, 2)
@@ -44,7 +47,7 @@ def tokens_of(batches: Iterable[TensorDictBase], num_rollouts: int) -> dict[int,
         for row, scene in enumerate(batch[keys.SCENE][::num_rollouts, 0].tolist()):
             assert scene not in found
             group = batch[row * num_rollouts : (row + 1) * num_rollouts]
-            assert (group[keys.SCENE] == scene).all()
+            assert (group[keys.SCENE] == scene).all() and (group["next", keys.SCENE] == scene).all()
             found[scene] = group[keys.TOKEN][..., : SIZES[scene]]
     return found
 
@@ -81,6 +84,21 @@ def test_rollouts_are_those_of_a_bare_loop(collect: Callable, model: MotionLM, s
         env = TransformedEnv(TrafficEnv([scenes[index]], num_rollouts=2), TokenAction(model.tokenizer))
         actor = MotionActor(model.eval(), Contexts([scenes[index]]), num_rollouts=2, decoding=Decoding())
         assert torch.equal(env.rollout(16, actor)[keys.TOKEN], tokens)
+
+
+def test_the_model_of_the_caller_stays_as_it_is(model: MotionLM, scenes: list[Scene]) -> None:
+    mine = copy.deepcopy(model).train()
+    collector = make_collector(scenes, mine, num_rollouts=2)
+    collector.update_policy_weights_({name: value + 1 for name, value in mine.state_dict().items()})
+    next(iter(collector))
+    assert mine.training and all(torch.equal(v, model.state_dict()[name]) for name, v in mine.state_dict().items())
+
+
+def test_arrivals_count_in_the_budget() -> None:
+    scene = straight_road(9)
+    scene.agents.valid[1:, :30] = False
+    with_them, without = (agents_of([scene], None, ContextOptions(arrivals=arrivals)) for arrivals in (True, False))
+    assert (with_them, without) == ({0: 9}, {0: 1})
 
 
 def test_rollouts_depend_on_the_seed_and_on_nothing_global(collect: Callable) -> None:
