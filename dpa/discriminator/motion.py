@@ -39,13 +39,15 @@ def width_of(road: Sequence[str] = ROAD) -> int:
     return len(OWN) + len(KINDS) + NEIGHBOUR_WIDTH * NEIGHBOURS + len(road)
 
 
-def until_first_hole(scene: Scene) -> Scene:
-    """The scene with every log invalid from its first hole after the current step on.
+def until_first_hole(scene: Scene, decision_steps: int = 1) -> Scene:
+    """The scene with every log invalid from the decision of its first hole after the current step on.
 
-    A tokenized log follows the log up to the first hole and no further, so nothing behind it can be compared.
+    A tokenized log follows the log up to the first hole and no further, so nothing behind it can be compared; nor can
+    the steps before it in the same decision, whose token leads to where the log has nothing.
 
     Args:
         scene: uncollated.
+        decision_steps: F, of a token; 1 cuts at the hole itself.
 
     Examples:
         >>> from envs.sources.synthetic import straight_road
@@ -53,11 +55,17 @@ def until_first_hole(scene: Scene) -> Scene:
         >>> scene.agents.valid[0, 20] = False
         >>> int(scene.agents.valid.sum()), int(until_first_hole(scene).agents.valid.sum())
         (90, 20)
+        >>> int(until_first_hole(scene, decision_steps=5).agents.valid.sum())
+        16
     """
     cut = scene.clone(recurse=False)
     cut.agents = scene.agents.clone(recurse=False)
     valid = scene.agents.valid.clone()
-    valid[:, CURRENT_STEP:] = valid[:, CURRENT_STEP:].cummin(-1).values
+    later = valid[:, CURRENT_STEP + 1 :]
+    steps, whole = torch.arange(later.shape[1], device=later.device), later.shape[1]
+    first = later.int().cummin(-1).values.sum(-1)
+    kept = torch.where(first < whole, first - first % decision_steps, whole)
+    valid[:, CURRENT_STEP + 1 :] = (steps < kept[:, None]) & valid[:, CURRENT_STEP, None]
     cut.agents.valid = valid
     return cut
 

@@ -197,6 +197,6 @@ def finished(path: Path, decided_by: dict[str, Any]) -> dict[str, Any] | None:
     differ = differences(options, decided_by)
     if differ:
         raise ValueError(
-            f"{path} was written with other options ({differ}); remove it, or name another file or folder."
+            f"{path} was written with other options ({differ}); name another file or folder, or remove it."
         )
     return content

@@ -47,8 +47,8 @@ class PartialResult:
             raise ValueError(f"{self.path} is damaged ({error}); remove it and run again.") from None
         if differ:
             raise ValueError(
-                f"{self.path} holds scenes that were scored with other options ({differ}); remove it, or "
-                "name another file or folder."
+                f"{self.path} holds scenes that were scored with other options ({differ}); name another "
+                "file or folder, or remove it."
             )
         self.path.parent.mkdir(parents=True, exist_ok=True)
         head = json.dumps(self._decided_by, sort_keys=True) + "\n"

@@ -411,7 +411,7 @@ def test_a_result_of_the_same_options_is_read_back_and_others_are_refused(tmp_pa
     assert finished(path, {"seed": 0}) is None
     write_json(path, {"options": {"seed": 0, "grid": [1, 2]}, "value": 3.0})
     assert finished(path, {"seed": 0, "grid": (1, 2)})["value"] == 3.0
-    with pytest.raises(ValueError, match=r"other options \('seed': 0 there, 1 here\); name another output"):
+    with pytest.raises(ValueError, match=r"other options \('seed': 0 there, 1 here\); name another file"):
         finished(path, {"seed": 1, "grid": (1, 2)})
 
 
