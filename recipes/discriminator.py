@@ -125,9 +125,8 @@ def measure_scene(
         seed: of the random groups.
     """
     motions, log = seen(each, sight, tokenizer, options)
-    scene = until_first_hole(
-        each.scene, options.decision_steps
-    )  # past it the log that rollouts are compared with means nothing
+    # Past it the log that rollouts are compared with means nothing.
+    scene = until_first_hole(each.scene, options.decision_steps)
     score, log_score = net.score(motions.rollouts, motions.valid), net.score(motions.log, motions.valid)
     ego = each.controlled.nonzero()[:, 0]
     both = torch.cat((log[None], each.trajectories))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, MutableMapping
-from statistics import fmean
+from statistics import fmean, pvariance
 from typing import Any
 
 WINDOW = 10
@@ -74,7 +74,7 @@ class SaturationWatch:
         if share <= TOO_MANY + ROUNDING or (step > 0 and len(window) < WINDOW):
             return None
         weight = fmean(weights)
-        spread = math.sqrt(fmean(w**2 + s**2 for w, s in zip(weights, spreads, strict=True)) - weight**2)
+        spread = math.sqrt(pvariance(weights) + fmean(each**2 for each in spreads))
         if spread < ALIKE and weight > 0.5:
             return None
         reason = (

@@ -149,8 +149,7 @@ class MotionActor(TensorDictModuleBase):
     def logits(self, tensordict: TensorDictBase) -> Tensor:
         """``[B, A, V]`` of the decision at hand; adds its nodes to the cache."""
         recent, step = tensordict[keys.RECENT], tensordict[keys.STEP][:, 0]
-        self._start(tensordict[keys.SCENE], step, recent.shape[:2])
-        self._check_contexts(tensordict, step == 0)
+        self._start(tensordict, step, recent.shape[:2])
         controlled = tensordict[keys.CONTROLLED]
         last = torch.where((step[:, None] > 0) & controlled, self._last, self.model.no_token)
         valid = tensordict[keys.VALID]
@@ -168,11 +167,11 @@ class MotionActor(TensorDictModuleBase):
         return torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
 
     # --- the start of episodes --------------------------------------------------------------------------------------
-    def _start(self, scene: Tensor, step: Tensor, shape: torch.Size) -> None:
+    def _start(self, tensordict: TensorDictBase, step: Tensor, shape: torch.Size) -> None:
         """Encode the scenes of which an episode starts, and draw the numbers that decide the rollouts that do."""
         if shape[0] % self.num_rollouts:
             raise ValueError(f"num_rollouts must divide the batch of {shape[0]} rows, got {self.num_rollouts}.")
-        begins = step == 0
+        scene, begins = tensordict[keys.SCENE], step == 0
         if (step == 1).any():
             self._count(scene, step)
         if not begins.any():
@@ -185,16 +184,17 @@ class MotionActor(TensorDictModuleBase):
         # Padding depends on the scenes of a batch, so a change of some encodes all: rare, and cheap beside the episode.
         self._scenes[fresh] = scene.view(-1, self.num_rollouts)[:, 0][fresh]
         context = collate_contexts([self.contexts[i] for i in self._scenes.tolist()]).to(step.device)
-        self._context = pad_context(context, shape[1])
+        context = pad_context(context, shape[1])
+        self._check_agents(context, tensordict, step == 0)
         with self._autocast(step.device):
-            self._memory = self.model.encode(self._context)
+            self._memory = self.model.encode(context)
         self._draw_noise(begins.nonzero()[:, 0].tolist(), scene.tolist())
 
-    def _check_contexts(self, tensordict: TensorDictBase, begins: Tensor) -> None:
+    def _check_agents(self, context: SceneContext, tensordict: TensorDictBase, begins: Tensor) -> None:
         """Refuse contexts of other agents than the environment's."""
         group = begins.nonzero()[:, 0] // self.num_rollouts
         for name, key in (("kind", keys.KIND), ("valid", keys.VALID), ("recent", keys.RECENT)):
-            mine, theirs = getattr(self._context, name)[group], tensordict[key][begins]
+            mine, theirs = getattr(context, name)[group], tensordict[key][begins]
             if not torch.allclose(mine.float(), theirs.float(), atol=1e-3):
                 raise ValueError(
                     f"the contexts of the policy and the environment differ in {name!r} of the agents of a scene; give "
