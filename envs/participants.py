@@ -55,10 +55,20 @@ def simulated_agents(scene: Scene, *, arrivals: bool = False, last_step: int = L
     """
     agents = scene.agents
     present = agents.present.nonzero()[:, 0]
-    arrive = (~agents.present & agents.valid[:, CURRENT_STEP + 1 : last_step + 1].any(-1)).nonzero()[:, 0]
+    arrive = _arrive(agents, last_step).nonzero()[:, 0]
     scene = select_agents(scene, torch.cat((present, arrive)) if arrivals else present)
     _fill(scene.agents)
     return scene
+
+
+def num_simulated(scene: Scene, *, arrivals: bool = False, last_step: int = LOG_STEPS - 1) -> int:
+    """How many agents :func:`simulated_agents` leaves, with the same arguments."""
+    agents = scene.agents
+    return int((agents.present | _arrive(agents, last_step) if arrivals else agents.present).sum())
+
+
+def _arrive(agents: Agents, last_step: int) -> Tensor:
+    return ~agents.present & agents.valid[:, CURRENT_STEP + 1 : last_step + 1].any(-1)
 
 
 def _fill(agents: Agents) -> None:
@@ -94,7 +104,7 @@ def largest_scene(scenes: SceneSource, *, arrivals: bool = False, last_step: int
     counts = None if arrivals else getattr(scenes, "num_agents", None)
     if counts is None:
         every = (scenes[index] for index in range(len(scenes)))
-        counts = [len(simulated_agents(s, arrivals=arrivals, last_step=last_step).agents.kind) for s in every]
+        counts = [num_simulated(scene, arrivals=arrivals, last_step=last_step) for scene in every]
     return int(max(counts))
 
 

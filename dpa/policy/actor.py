@@ -149,7 +149,7 @@ class MotionActor(TensorDictModuleBase):
     def logits(self, tensordict: TensorDictBase) -> Tensor:
         """``[B, A, V]`` of the decision at hand; adds its nodes to the cache."""
         recent, step = tensordict[keys.RECENT], tensordict[keys.STEP][:, 0]
-        self._start(tensordict, step, recent.shape[:2])
+        self._start(tensordict)
         controlled = tensordict[keys.CONTROLLED]
         last = torch.where((step[:, None] > 0) & controlled, self._last, self.model.no_token)
         valid = tensordict[keys.VALID]
@@ -167,8 +167,9 @@ class MotionActor(TensorDictModuleBase):
         return torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
 
     # --- the start of episodes --------------------------------------------------------------------------------------
-    def _start(self, tensordict: TensorDictBase, step: Tensor, shape: torch.Size) -> None:
+    def _start(self, tensordict: TensorDictBase) -> None:
         """Encode the scenes of which an episode starts, and draw the numbers that decide the rollouts that do."""
+        step, shape = tensordict[keys.STEP][:, 0], tensordict[keys.VALID].shape
         if shape[0] % self.num_rollouts:
             raise ValueError(f"num_rollouts must divide the batch of {shape[0]} rows, got {self.num_rollouts}.")
         scene, begins = tensordict[keys.SCENE], step == 0

@@ -50,9 +50,8 @@ def _masks(measured: Features, config: RealismConfig) -> dict[str, Tensor]:
     ttc = scored & measured.vehicle[0, :, None] if config.ttc_vehicle_only else scored
     if Quirk.LAST_TTC not in config.quirks and config.differences == "central":
         ttc = ttc & (torch.arange(steps, device=ttc.device) < steps - 1)
-    if (
-        Quirk.INVALID_AT_ORIGIN not in config.quirks
-    ):  # beside a hole of the log there is no speed; the ends are no holes
+    # Beside a hole of the log there is no speed; the ends are no holes.
+    if Quirk.INVALID_AT_ORIGIN not in config.quirks:
         ttc = ttc & _with_neighbours(pad(measured.valid, (1, 1), value=True), config.differences)[:, 1:-1][:, -steps:]
     return {
         "linear_speed": speed[:, -steps:],

@@ -20,7 +20,7 @@ from dpa.policy.sampling import Decoding
 from dpa.rollout.crew import Crew, Outcome, Workers, hire
 from dpa.rollout.job import PostProcess, RolloutJob
 from dpa.rollout.plan import GIB, RolloutTask, bytes_per_row, plan_tasks
-from envs.participants import simulated_agents
+from envs.participants import num_simulated
 from envs.scene import CURRENT_STEP, SceneSource
 
 MOST_LOSSES = 3
@@ -255,4 +255,4 @@ def agents_of(scenes: SceneSource, indices: Sequence[int] | None, options: Conte
         return {i: int(known[i]) for i in wanted}
     last = CURRENT_STEP + options.decision_steps * options.horizon
     cast = {"arrivals": options.arrivals, "last_step": last}
-    return {i: len(simulated_agents(scenes[i], **cast).agents.kind) for i in wanted}
+    return {i: num_simulated(scenes[i], **cast) for i in wanted}

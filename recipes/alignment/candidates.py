@@ -115,7 +115,8 @@ def make_candidates(
     if data.kind == "expert":
         expert = _check_expert(data, store, expert)
     contexts = Contexts(scenes, options)
-    rows = [row for row, scene in enumerate(store.scenes.tolist()) if among is None or scene in among]
+    wanted = set(store.scenes.tolist() if among is None else among)
+    rows = [row for row, scene in enumerate(store.scenes.tolist()) if scene in wanted]
     groups = []
     for row, chosen in zip(rows, _choose(data, store, rows, seed), strict=True):
         if not len(chosen.preferred):

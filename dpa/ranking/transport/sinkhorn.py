@@ -97,9 +97,8 @@ class Sinkhorn:
             if bool(done.all()):
                 break
         coupling = pairs * (u[:, :, None] + v[:, None] - cost / epsilon).exp()
-        return Dense(
-            coupling.where(pairs > 0, 0.0), error
-        )  # steps that do not count have no cost, and potentials at will
+        # Steps that do not count have no cost, and potentials at will.
+        return Dense(coupling.where(pairs > 0, 0.0), error)
 
 
 def _potential(scaled: Tensor, other: Tensor, log_mass: Tensor, dim: int) -> Tensor:
