@@ -55,8 +55,14 @@ class Framing:
         Args:
             blocks: in order.
             record: of them, as JSON can hold it.
+
+        Raises:
+            ValueError: the record is larger than any that is read back.
         """
-        packed = zstandard.ZstdCompressor(level=LEVEL, write_checksum=True).compress(json.dumps(record).encode())
+        text = json.dumps(record).encode()
+        if len(text) > MAX_RECORD:
+            raise ValueError(f"a {self.kind} of {len(blocks)} blocks is too large to be read back; put fewer into one.")
+        packed = zstandard.ZstdCompressor(level=LEVEL, write_checksum=True).compress(text)
         return b"".join([self.magic, *blocks, packed, self._footer.pack(len(packed), self.magic)])
 
     def offsets(self, sizes: Sequence[int]) -> list[int]:

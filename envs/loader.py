@@ -10,6 +10,7 @@ import atexit
 import hashlib
 import json
 import os
+import resource
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
 from typing import Any
@@ -26,6 +27,7 @@ Key = tuple[int, list[int]]
 """What makes a batch: the epoch and the indices of its scenes."""
 Prepare = Callable[[Scene, torch.Generator], Any]
 UNCHANGED = Augmentation()
+OPEN_FILES = 1 << 16
 
 
 class SceneLoader:
@@ -231,6 +233,8 @@ class _Batches(Dataset):
 
 def _prefetched(batches: _Batches, keys: list[Key], workers: int) -> Iterable[Any]:
     """The batches of the keys that the list holds when an iteration begins."""
+    if workers:
+        _allow_open_files()
     return DataLoader(
         batches,
         sampler=keys,
@@ -244,6 +248,14 @@ def _prefetched(batches: _Batches, keys: list[Key], workers: int) -> Iterable[An
         # DataLoader draws a seed for its workers, by default from the global generator, which is the model's.
         generator=torch.Generator(),
     )
+
+
+def _allow_open_files() -> None:
+    """Each tensor of a batch that a worker sends is an open file here, and usual limits are a thousand at first."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = OPEN_FILES if hard == resource.RLIM_INFINITY else min(OPEN_FILES, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 def _as_it_is(batch: Any) -> Any:

@@ -275,6 +275,27 @@ class SceneSource(Protocol):
     def __getitem__(self, index: int, /) -> Scene: ...
 
 
+def check_episode(decision_steps: int, horizon: int) -> None:
+    """Refuse episodes that a log cannot begin or does not reach the end of.
+
+    Args:
+        decision_steps: of 0.1 s, between two decisions.
+        horizon: decisions.
+
+    Raises:
+        ValueError: naming both numbers.
+    """
+    if decision_steps > CURRENT_STEP:
+        raise ValueError(
+            f"decision_steps must be at most the {CURRENT_STEP} steps of 0.1 s of the history, got {decision_steps}."
+        )
+    if CURRENT_STEP + decision_steps * horizon >= LOG_STEPS:
+        raise ValueError(
+            f"horizon * decision_steps must be at most {LOG_STEPS - 1 - CURRENT_STEP} steps of 0.1 s, got "
+            f"{horizon} * {decision_steps}."
+        )
+
+
 def select_agents(scene: Scene, index: Tensor) -> Scene:
     """Keep some agents of one uncollated scene, in the order given.
 

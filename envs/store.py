@@ -33,8 +33,8 @@ class Manifest:
     Attributes:
         source: name of the source that the scenes came from.
         options: how they were converted.
-        named: what the user named as inputs; a moved file changes nothing.
-        plan: digest of the inputs and their order; a conversion goes on only with its own plan.
+        named: what the user named as inputs.
+        plan: digest of the inputs' paths, sizes and order; a conversion goes on only with its own.
         complete: every shard is there.
         shards: ``name``, number of ``scenes`` and ``sha256`` of the file of each shard, in order.
         skipped: records that gave no scene: ``input``, ``record`` and ``error``.

@@ -24,7 +24,7 @@ from envs.participants import (
     pad_agents,
     simulated_agents,
 )
-from envs.scene import CURRENT_STEP, LOG_STEPS, AgentKind, Scene, SceneSource, collate
+from envs.scene import CURRENT_STEP, AgentKind, Scene, SceneSource, check_episode, collate
 from envs.signals import Signals
 
 
@@ -109,7 +109,7 @@ class TrafficEnv(EnvBase):
         sizes = {"num_scenes": num_scenes, "num_rollouts": num_rollouts, "max_controlled": max_controlled}
         sizes |= {} if num_agents is None else {"num_agents": num_agents}
         _check_positive(**sizes, decision_steps=decision_steps, horizon=horizon)
-        _check_episode(decision_steps, horizon)
+        check_episode(decision_steps, horizon)
         super().__init__(device=device, batch_size=[num_scenes * num_rollouts])
         self.scenes = scenes
         self.num_scenes, self.num_rollouts = num_scenes, num_rollouts
@@ -274,15 +274,3 @@ def _check_positive(**sizes: int) -> None:
     for name, value in sizes.items():
         if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
             raise ValueError(f"{name} must be a whole number of 1 or more, got {value!r}.")
-
-
-def _check_episode(decision_steps: int, horizon: int) -> None:
-    if decision_steps > CURRENT_STEP:
-        raise ValueError(
-            f"decision_steps must be at most the {CURRENT_STEP} steps of 0.1 s of the history, got {decision_steps}."
-        )
-    if CURRENT_STEP + decision_steps * horizon >= LOG_STEPS:
-        raise ValueError(
-            f"horizon * decision_steps must be at most {LOG_STEPS - 1 - CURRENT_STEP} steps of 0.1 s, got "
-            f"{horizon} * {decision_steps}."
-        )

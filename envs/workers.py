@@ -6,8 +6,9 @@ import multiprocessing
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from itertools import islice
 from typing import Any, TypeVar
 
 import torch
@@ -53,22 +54,26 @@ def _run_in_pool(work: Work, tasks: Sequence[Task], workers: int, tick: Callable
     context = multiprocessing.get_context("spawn")  # a forked process would inherit the threads' locks of torch
     made = context.Value("q", 0)
     pool = ProcessPoolExecutor(workers, context, _start_worker, (made,))
-    counted = 0
+    waiting, running, counted = iter(tasks), dict[Future, Task](), 0
     try:
-        waiting = {pool.submit(_work_and_count, work, task): task for task in tasks}
-        while waiting:
-            done, _ = wait(waiting, _POLL_SECONDS, FIRST_COMPLETED)
+        while True:
+            # A pool starts whatever it has been handed, even when it is told to stop: so no more than it has hands.
+            for task in islice(waiting, workers - len(running)):
+                running[pool.submit(_work_and_count, work, task)] = task
+            if not running:
+                break
+            done, _ = wait(running, _POLL_SECONDS, FIRST_COMPLETED)
             tick(made.value - counted)
             counted = made.value
             for future in done:
                 future.result()
-                yield waiting.pop(future)
+                yield running.pop(future)
     except BrokenProcessPool as error:
         raise SceneError(
             "a worker was killed, perhaps for want of memory; run it again with fewer workers or smaller shards."
         ) from error
     finally:
-        pool.shutdown(cancel_futures=True)
+        pool.shutdown()
 
 
 _made: Any = None

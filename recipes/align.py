@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 from dpa.losses import SaturationWatch
 from dpa.report.curves import read_curves
 from dpa.report.findings import SATURATED
-from dpa.training.batches import ShuffledOrder
+from dpa.training.batches import ShuffledOrder, with_tokens
 from dpa.training.distributed import ALONE, Ranks, join_ranks
 from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
 from dpa.training.run import Run
@@ -119,7 +119,7 @@ def align(
             run.log(look(device), 0)
         for step in run.steps():
             draw = make_generator(seed, "pairs", step)
-            groups = [candidates[i] for i in order(step)]
+            groups = with_tokens([candidates[i] for i in order(step)])
             losses = accumulate_gradients(loss, parts_of(groups, options, draw, device, ranks), ranks)
             norm = clip_and_step(optimizer, options.max_norm, schedule)
             tell(method, saturation(step, losses), ranks)
@@ -164,7 +164,7 @@ def check_enough(candidates: Candidates, pairs_per_scene: int) -> None:
     Raises:
         ValueError: some scenes have fewer pairs than a step takes, and others have more.
     """
-    counts = {len(group.preferred) for group in candidates}
+    counts = candidates.counts
     if len(counts) > 1 and min(counts) < pairs_per_scene:
         raise ValueError(
             f"alignment.pairs_per_scene={pairs_per_scene} and scenes have {min(counts)} to {max(counts)} pairs after "

@@ -57,12 +57,8 @@ def collect(
     model, context, config = open_policy(policy, cfg.device)
     distance = distance or build_distance(options.ranking, "collection.ranking")
     # What is wrong with an option is told before a store is begun with it.
-    decoding = build(Decoding, options.decoding, "collection.decoding")
-    workers = build(Workers, options.workers, "collection.workers")
-    check_precision(options.precision)
+    decoding, workers = check_collection(options)
     rows_within(options.memory, model, context)
-    if options.num_rollouts < 1:
-        raise ValueError(f"collection.num_rollouts must be 1 or more, got {options.num_rollouts}.")
     provenance = Provenance(
         policy=weights_digest(model),
         scenes=fingerprint(scenes),
@@ -97,6 +93,23 @@ def collect(
             ):
                 bar.update(writer.append(groups))
     return PreferenceStore(folder)
+
+
+def check_collection(options: DictConfig) -> tuple[Decoding, Workers]:
+    """How tokens are drawn and by whom.
+
+    Args:
+        options: the section ``collection``.
+
+    Raises:
+        ValueError: naming the option that cannot be.
+    """
+    decoding = build(Decoding, options.decoding, "collection.decoding")
+    workers = build(Workers, options.workers, "collection.workers")
+    check_precision(options.precision)
+    if options.num_rollouts < 1:
+        raise ValueError(f"collection.num_rollouts must be 1 or more, got {options.num_rollouts}.")
+    return decoding, workers
 
 
 @hydra.main(**CONFIG, config_name="collect")

@@ -57,7 +57,7 @@ def compare(cfg: DictConfig) -> dict[str, Any]:
     splits, runs, made = open_splits(cfg.scenes), runs_of(cfg), provenance("compare", cfg.device)
     with alone_in(runs.root):
         write_scene_cards(runs.scenes, splits)
-        with Workers(cfg.workers, cfg.threads) as workers:
+        with Workers(cfg.workers, cfg.threads, spread=cfg.device == "cuda") as workers:
             stages = Stages(workers, runs.stages)
             train_policies(cfg, stages)
             chosen = choose(cfg, stages)

@@ -196,6 +196,8 @@ def mean_known(values: list[float | None]) -> float | None:
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.evaluate``."""
+    if cfg.json is None:
+        raise ValueError("json=null: the result needs a file, from which it also goes on after a kill; say json=FILE.")
     plan = None
     if cfg.submission is not None:
         rollouts = cfg.evaluation.num_rollouts

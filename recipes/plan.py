@@ -100,8 +100,8 @@ def make_plan(rates: dict[str, float], memory: dict[str, float], options: argpar
     def hours(rollouts: float, rate: str) -> float:
         return rollouts * options.agents * STEPS / rates[rate] / options.workers / 3600
 
-    evaluated = hours(options.eval_scenes * SCORED_ROLLOUTS, "collector")
-    evaluated += options.eval_scenes * options.metric_seconds / options.workers / 3600
+    evaluated = hours(options.eval_scenes * SCORED_ROLLOUTS, "collector") * options.workers  # by one process
+    evaluated += options.eval_scenes * options.metric_seconds / 3600
     trained = options.pretraining_steps * options.pretraining_batch
     converted = (options.scenes + options.eval_scenes) / options.convert_rate / 60 / options.workers
     return [
@@ -121,7 +121,7 @@ def make_plan(rates: dict[str, float], memory: dict[str, float], options: argpar
             memory["trained"],
             "updates x pairs x agents",
         ),
-        Part("evaluate", evaluated, 0.1, memory["collector"], "scenes x agents"),
+        Part("evaluate, one process", evaluated, 0.1, memory["collector"], "scenes x agents"),
     ]
 
 

@@ -21,7 +21,7 @@ from tensordict import TensorDict
 
 from dpa.losses import NextTokenLoss, token_network
 from dpa.policy import MotionLM
-from dpa.training.batches import Item, LogReader, collate_items, micro_batches
+from dpa.training.batches import Item, LogReader, collate_items, micro_batches, with_tokens
 from dpa.training.distributed import ALONE, Ranks, join_ranks
 from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
 from dpa.training.run import Run
@@ -155,15 +155,17 @@ def training_items(
     )
 
 
-def with_tokens(items: list[Item]) -> list[Item]:
-    """Those that have something to predict; if there are none, one that does not count: no rank is without a pass."""
-    return [item for item in items if item.token_valid.any()] or items[:1]
-
-
 def log_items(scenes: SceneSource, read: LogReader, ranks: Ranks = ALONE) -> list[Item]:
     """This rank's part of the tokenized logs of a few scenes, always the same."""
     bar = progress(ranks.mine(range(len(scenes))), "tokens", unit="scene", disable=not ranks.main)
-    return with_tokens([read(scenes[index], make_generator(0, "tune", index)) for index in bar])
+    items = with_tokens([read(scenes[index], make_generator(0, "tune", index)) for index in bar])
+    if not ranks.sum(torch.tensor(sum(int(item.token_valid.sum()) for item in items))):
+        raise ValueError(
+            f"none of the {len(scenes)} tuning scenes has a token to predict: no agent that the policy controls "
+            f"(model.context.control={read.options.control}) has a log after the current step; say "
+            "model.context.control=all, or name other scenes.tune."
+        )
+    return items
 
 
 @torch.no_grad()

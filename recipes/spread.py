@@ -84,6 +84,8 @@ def spreads(rollouts: Iterable[Rolled], names: Sequence[str]) -> list[Spread]:
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.spread``."""
     names = feature_names(cfg.features if isinstance(cfg.features, str) else list(cfg.features))
+    if cfg.split == "eval":
+        raise ValueError("split=eval: spreads become part of a distance, which is not fitted on evaluation scenes.")
     scenes = open_splits(cfg.scenes)[cfg.split]
     model, options, _ = open_policy(cfg.policy)
     store = open_preferences(cfg.preferences, scenes, model, cfg.policy)

@@ -87,7 +87,8 @@ def main(cfg: DictConfig) -> None:
     for name, row in errors.items():
         table.add_row(name, *(f"{value:.3f}" if isinstance(value, float) else str(value) for value in row.values()))
     Console().print(table)
-    write_json(cfg.json, {"tokenizer": plain(cfg.model.tokenizer), "scenes": len(scenes), "errors": errors})
+    if cfg.json is not None:
+        write_json(cfg.json, {"tokenizer": plain(cfg.model.tokenizer), "scenes": len(scenes), "errors": errors})
 
 
 if __name__ == "__main__":

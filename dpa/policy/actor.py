@@ -33,11 +33,12 @@ def check_precision(precision: str) -> Precision:
 
 
 class Contexts:
-    """Contexts of the scenes of a source, made on first use and kept.
+    """Contexts of the scenes of a source, made on first use; the latest are kept.
 
     Args:
         scenes: where scenes come from.
         options: how they are cut up.
+        most: contexts that are kept, of about 100 KB each.
 
     Examples:
         >>> from envs.sources.synthetic import straight_road
@@ -46,9 +47,10 @@ class Contexts:
         (1, 'straight_road_2_None')
     """
 
-    def __init__(self, scenes: SceneSource, options: ContextOptions | None = None) -> None:
+    def __init__(self, scenes: SceneSource, options: ContextOptions | None = None, most: int = 4096) -> None:
         self.scenes = scenes
         self.options = options or ContextOptions()
+        self.most = most
         self._made: dict[int, tuple[SceneContext, str]] = {}
 
     def __len__(self) -> int:
@@ -62,10 +64,14 @@ class Contexts:
         return self._entry(index)[1]
 
     def _entry(self, index: int) -> tuple[SceneContext, str]:
-        if index not in self._made:
+        entry = self._made.pop(index, None)
+        if entry is None:
             scene = self.scenes[index]
-            self._made[index] = make_context(scene, self.options), scene.scene_id
-        return self._made[index]
+            entry = make_context(scene, self.options), scene.scene_id
+        if len(self._made) >= self.most:
+            del self._made[next(iter(self._made))]  # the one whose last use is longest ago
+        self._made[index] = entry
+        return entry
 
 
 class MotionActor(TensorDictModuleBase):

@@ -1,7 +1,8 @@
 """What the policy sees of a scene: map pieces, lights and histories, each in a frame of its own.
 
 Long polylines are cut into pieces of about ten metres. A piece, a light or an agent is a pose plus features measured
-from that pose, so nothing here depends on where the scene lies or how it is turned.
+from that pose, so nothing here depends on where the scene lies or how it is turned (but for which of the farthest
+pieces are seen, where there are more than ``max_pieces``).
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from envs.geometry.frames import rotate, to_local, wrap_angle
 from envs.participants import MAX_CONTROLLED, Control, check_control, choose_controlled, simulated_agents
-from envs.scene import CURRENT_STEP, LOG_STEPS, STEP_SECONDS, Agents, Lights, LightState, RoadMap, Scene
+from envs.scene import CURRENT_STEP, LOG_STEPS, STEP_SECONDS, Agents, Lights, LightState, RoadMap, Scene, check_episode
 
 PIECE_POINTS = 5
 """Points that describe a piece."""
@@ -58,11 +59,7 @@ class ContextOptions:
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
         check_control(self.control)
-        if HISTORY + self.decision_steps * self.horizon > LOG_STEPS:
-            raise ValueError(
-                f"horizon * decision_steps must be at most {LOG_STEPS - HISTORY} steps of 0.1 s, got "
-                f"{self.horizon} * {self.decision_steps}."
-            )
+        check_episode(self.decision_steps, self.horizon)
 
 
 class SceneContext(TensorClass["nocast"]):
@@ -84,8 +81,8 @@ class SceneContext(TensorClass["nocast"]):
         recent: ``[*, A, F + 1, 3]`` poses of the last decision before the episode.
         valid: ``[*, A]`` bool, the agent is there at the current step; false for padding and arrivals.
         controlled: ``[*, A]`` bool.
-        logged: ``[*, A, T * F, 3]`` logged poses to come; 0 where invalid, but for arrivals that are still to come, see
-            :func:`~envs.participants.simulated_agents`.
+        logged: ``[*, A, T * F, 3]`` logged poses to come; where invalid, what
+            :func:`~envs.participants.simulated_agents` holds there: read it under its mask.
         logged_valid: ``[*, A, T * F]`` bool.
     """
 
@@ -202,7 +199,8 @@ def _cut(road: RoadMap, length: float) -> tuple[Tensor, Tensor, Tensor]:
     """Cut polylines into runs of points: owner, first and last point of each run, all ``[pieces]``."""
     step = (road.points[1:, :2] - road.points[:-1, :2]).norm(dim=-1)
     arc = torch.cat((step.new_zeros(1), step.double().cumsum(0)))
-    first, last = road.start, road.start + (road.count - 1).clamp(min=0)
+    first = road.start.clamp(max=len(arc) - 1)  # features without points may come last
+    last = first + (road.count - 1).clamp(min=0)
     total = arc[last] - arc[first]
     pieces = (total / length).ceil().clamp(min=1).long() * (road.count > 0)
     owner = torch.repeat_interleave(torch.arange(len(pieces)), pieces)

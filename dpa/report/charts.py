@@ -144,7 +144,7 @@ def forest(
     figure = go.Figure()
     step = min(0.28, 0.8 / len(groups))
     for place, (kind, values) in enumerate(groups.items()):
-        shift = step * (place - (len(groups) - 1) / 2)
+        shift, told = step * (place - (len(groups) - 1) / 2), escape(kind, quote=False)
         at = {name: rows.index(name) + shift for name in values}
         colour = {name: each.colour if colours is None else colours[kind] for name, each in values.items()}
         for shade in dict.fromkeys(colour.values()):
@@ -156,14 +156,14 @@ def forest(
             )  # fmt: skip
         hovers = [lines(f"{name}, {kind}".replace("\n", " ")) + "<br>" + each.text for name, each in values.items()]
         figure.add_scatter(
-            x=[each.mean for each in values.values()], y=list(at.values()), mode="markers", name=kind, legendgroup=kind,
+            x=[each.mean for each in values.values()], y=list(at.values()), mode="markers", name=told, legendgroup=kind,
             marker=_dot(list(colour.values()), hollow=bool(place) and colours is None), showlegend=False,
             hovertext=hovers, hoverinfo="text",
         )  # fmt: skip
         # The legend tells kinds apart; a colour that means better or worse is not theirs.
         shade = NEUTRAL if colours is None else colours[kind]
         figure.add_scatter(
-            x=[None], y=[None], mode="markers", name=kind, legendgroup=kind,
+            x=[None], y=[None], mode="markers", name=told, legendgroup=kind,
             marker=_dot(shade, hollow=bool(place) and colours is None),
         )  # fmt: skip
     ends = [end for values in groups.values() for each in values.values() for end in (each.low, each.high)]

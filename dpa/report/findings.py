@@ -93,11 +93,11 @@ def chosen_on_the_same(experiment: Experiment) -> str | None:
 
 
 def left_out(experiment: Experiment) -> str | None:
-    """How many scenes the differences do without."""
+    """How many scenes realism does without."""
     if not experiment.left_out:
         return None
     rest = experiment.scenes[experiment.split] - experiment.left_out
-    return f"Differences are over {rest} of {experiment.reported}: on the others some run has no realism."
+    return f"Realism and its differences are over {rest} of {experiment.reported}: on the others some run has none."
 
 
 def budgets(experiment: Experiment) -> str | None:

@@ -81,6 +81,6 @@ def _draw_likeliest(
     first = [
         first_new(flags[row], before) for flags, before in zip((judged.collides, judged.offroad), logged, strict=True)
     ]
-    draw_panel(axes, scene, pose_tracks(scene, poses), f"{name}\n{nats:.2f} nats, distance {distance:.1f}")
+    draw_panel(axes, scene, pose_tracks(scene, poses), f"{name}\n{nats:.2f} nats per token, distance {distance:.1f}")
     draw_marks(axes, poses, first)
     return first

@@ -374,7 +374,8 @@
     const seconds = (state.time - data.now) * data.seconds;
     return entry.pairs.find((pair, i) => {
       const before = i ? entry.pairs[i - 1].rollout : 0;
-      return seconds > before + 1e-6 && seconds <= pair.rollout + 1e-6;
+      // Of a moment that the log leaves out there is none, although a later pair follows.
+      return seconds > Math.max(before, pair.rollout - entry.step) + 1e-6 && seconds <= pair.rollout + 1e-6;
     }) || null;
   }
 
@@ -483,8 +484,9 @@
   function sentenceOf(scene, entry) {
     const name = scene.agents[entry.agent].replace(/^./, (letter) => letter.toUpperCase()), pairs = entry.pairs, steps = plural(pairs.length, "step");
     if (!entry.paid) return `${name} pays nothing: this rollout drives it as the log does.`;
+    if (!pairs.length) return `${name} pays ${percent(entry.part)} of what all agents pay (${entry.paid.toFixed(1)}); its log is too short to show here what it is coupled with.`;
     const [feature, share] = entry.shares.reduce((a, b) => b[1] > a[1] ? b : a);
-    const pays = `${name} pays ${percent(entry.part)} of this rollout's distance (${entry.paid.toFixed(1)}), most of it for ${feature} (${share}${GAP}%).`;
+    const pays = `${name} pays ${percent(entry.part)} of what all agents pay (${entry.paid.toFixed(1)}), most of it for ${feature} (${share}${GAP}%).`;
     const away = pairs.filter((pair) => Math.abs(pair.log - pair.rollout) > NEAR + 1e-6);
     if (!away.length) return `${pays} All ${steps} lie on the diagonal: they are coupled with the same moment of the log, give or take ${NEAR}${GAP}s.`;
     const mean = away.reduce((sum, pair) => sum + Math.abs(pair.log - pair.rollout), 0) / away.length;
@@ -554,7 +556,8 @@
 
   function tick(clock) {
     if (!state.playing) { state.last = null; return; }
-    if (state.last !== null) state.time += (clock - state.last) / 1000 / data.seconds * Number($("speed").value);
+    // Pages that are out of sight get no frames: what time has passed there is not played.
+    if (state.last !== null) state.time += Math.min(clock - state.last, 100) / 1000 / data.seconds * Number($("speed").value);
     state.last = clock;
     if (state.time >= data.steps - 1) { state.time = data.steps - 1; state.playing = false; state.last = null; }
     else refresh();
@@ -568,7 +571,7 @@
   }
 
   const ending = (number) => ["th", "st", "nd", "rd"][number % 100 > 10 && number % 100 < 14 ? 0 : number % 10] || "th";
-  const nats = (value) => value.toPrecision(3).replace("-", "−") + " nats";
+  const nats = (value) => value.toPrecision(3).replace("-", "−") + " nats per token";
 
   function describe(given, index) {
     const kept = given.kept[index], place = 1 + kept[$("sort").value];
@@ -730,7 +733,7 @@
   for (const [name, factor] of [["in", 1 / 1.4], ["out", 1.4]]) $(name).addEventListener("click", () => zoom(factor, [1, 1], 2));
   for (const name of ["paths", "ghost", "marks"]) $(name).addEventListener("change", refresh);
   handle($("log"), () => sceneAt(state.scene).log);
-  handle($("roll"), () => rolloutAt(sceneAt(state.scene), state.method, state.rollout));
+  handle($("roll"), () => state.method === null ? sceneAt(state.scene).log : rolloutAt(sceneAt(state.scene), state.method, state.rollout));
   new ResizeObserver(refresh).observe($("log"));     // also when the player is shown that was hidden, or the page is zoomed
   document.addEventListener("keydown", (event) => {
     // Lists, buttons and fields have a use of their own for these keys, and so has a page of which the player is a part.

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 SCENES, SEEDS_AND_SCENES = "scenes", "seeds and scenes"
 _COUNTS_AT_ONCE, _COUNTS_KEPT = 10_000_000, 2_000_000
-"""Bounds on the counts (resamples x scenes) held at one time, 80 MB, and kept for the next interval, 16 MB."""
+"""Bounds on the counts (resamples x scenes) held at one time, 80 MB, and kept for the next intervals, 16 MB each."""
 
 
 @dataclass(frozen=True)

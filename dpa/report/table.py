@@ -121,7 +121,7 @@ def cells(records: Sequence[dict[str, Any]]) -> list[list[str]]:
     return [
         [
             record["method"],
-            *(number(record[key], 2) for _, key in decoding),
+            *(_setting(record[key]) for _, key in decoding),
             str(record["n_seeds"]),
             *(number(record[column.key], column.digits) for column in COLUMNS),
             difference(record["realism_difference"], record["ci95"]),
@@ -228,17 +228,31 @@ def to_markdown(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
 
 
+def _setting(value: float | None) -> str:
+    """An option with two digits, or as many as it needs: two that differ must not look alike."""
+    return number(value, 2) if value is None or round(value, 2) == value else f"{value:g}"
+
+
 def _decoding(records: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
     """Titles and keys of what is told of the decoding; a temperature of 1 is not."""
     told = {"top-p": ("top_p", {None}), "temperature": ("temperature", {None, 1.0})}
     return [(title, key) for title, (key, plain) in told.items() if {record[key] for record in records} - plain]
 
 
+def mean_over_seeds(values: Sequence[float | None]) -> float | None:
+    """The mean, or None where a seed lacks a value: means over some of them would stand beside means over all.
+
+    Examples:
+        >>> mean_over_seeds([0.5, 0.7]), mean_over_seeds([0.5, None])
+        (0.6, None)
+    """
+    return None if not values or None in values else math.fsum(values) / len(values)
+
+
 def _mean(values: list[float | None], method: str, key: str) -> float | None:
     if any(value is not None and math.isnan(value) for value in values):
         raise ValueError(f"{method}: {key} is NaN in one of its rows; write None where nothing was measured.")
-    # A mean over some of the seeds would stand beside means over all of them.
-    return None if any(value is None for value in values) else math.fsum(values) / len(values)
+    return mean_over_seeds(values)
 
 
 def _owner(entry: Mapping[str, Any], records: list[dict[str, Any]]) -> dict[str, Any]:

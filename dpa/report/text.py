@@ -150,13 +150,13 @@ def likelihood_table(experiment: Experiment) -> str:
 
 
 def _made(experiment: Experiment) -> str:
-    scenes = experiment.scenes
+    scenes, over = experiment.scenes, "both" if len(experiment.seeds) > 1 else "scenes alone"
     return (
         f"{scenes['train']} training, {scenes['tune']} tuning and {scenes['eval']} evaluation scenes of "
         f"{scenes['source']}; numbers are of the {experiment.reported}; seeds {', '.join(map(str, experiment.seeds))}; "
         f"realism of {experiment.metric}; {experiment.date[:10] or MISSING}, commit "
         f"{experiment.revision or MISSING}; {experiment.machine}; {duration(experiment.worker_seconds)} of one "
-        "worker. Differences are paired by scene and seed, with 95 % intervals over both."
+        f"worker. Differences are paired by scene and seed, with 95 % intervals over {over}."
     )
 
 

@@ -36,11 +36,12 @@ class RayCrew:
         if not self._ray.is_initialized():
             self._ray.init(address=workers.address, include_dashboard=False, log_to_driver=False, logging_level="error")
         self.size = workers.count
-        needs = {"num_cpus": workers.threads, "num_gpus": int(str(job.device).startswith("cuda"))}
+        device = torch.device(job.device).type  # without an index: Ray shows a worker its own GPU as the only one
+        needs = {"num_cpus": workers.threads, "num_gpus": int(device == "cuda")}
         self._needs = f"{needs['num_cpus']} CPUs and {needs['num_gpus']} GPUs"
         self._hire = self._ray.remote(**needs, max_restarts=0)(_Hand).remote
         self._threads = workers.threads
-        self._job = self._ray.put(replace(job, model=copy.deepcopy(job.model).cpu(), device=str(job.device)))
+        self._job = self._ray.put(replace(job, model=copy.deepcopy(job.model).cpu(), device=device))
         self._latest: tuple[Any, int] = (None, job.seed)
         self._hands = [self._start() for _ in range(self.size)]
         self._running: dict[Any, int] = {}
@@ -57,9 +58,17 @@ class RayCrew:
             return worker, Outcome(self._ray.get(ready))
         except self._ray.exceptions.RayTaskError as error:
             return worker, Outcome(error=error.cause)
-        except self._ray.exceptions.RayActorError:
-            self._hands[worker] = self._start()
-            return worker, Outcome()
+        except self._ray.exceptions.RayActorError as error:
+            if getattr(error, "actor_init_failed", False):
+                told = f"a Ray worker could not start: {str(error).strip().splitlines()[-1]}"
+                return worker, Outcome(error=ChildProcessError(told))
+            return self._lost(worker)
+        except self._ray.exceptions.OutOfMemoryError:
+            return self._lost(worker)
+
+    def _lost(self, worker: int) -> tuple[int, Outcome]:
+        self._hands[worker] = self._start()
+        return worker, Outcome()
 
     def _ready(self) -> Any:
         """The next task that is done. A cluster that lacks what the workers need lets them wait without a word."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, TypeVar
 
 import torch
 from tensordict import TensorDict
@@ -125,6 +125,20 @@ def collate_items(items: Sequence[Item]) -> TensorDict:
         },
         batch_size=[len(items)],
     )
+
+
+class WithTokens(Protocol):
+    """What tokens are learnt from: an :class:`Item`, or rollouts of a scene."""
+
+    token_valid: Tensor
+
+
+Learnt = TypeVar("Learnt", bound=WithTokens)
+
+
+def with_tokens(items: list[Learnt]) -> list[Learnt]:
+    """Those that have something to learn; if there are none, one that does not count: no rank is without a pass."""
+    return [item for item in items if item.token_valid.any()] or items[:1]
 
 
 def micro_batches(sizes: Sequence[int], max_rows: int) -> list[list[int]]:

@@ -20,7 +20,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from envs.convert.describe import write_card
-from envs.convert.plan import Task, digest, make_plan
+from envs.convert.plan import Task, digest, find_inputs, make_plan
 from envs.convert.work import make_shards
 from envs.files import PARTIAL_PREFIX
 from envs.options import differences
@@ -33,6 +33,9 @@ from envs.workers import run_tasks
 
 SHARD_SIZE = 256
 """Scenes in a shard. Each worker holds one shard of packed scenes in memory (about 25 MB for WOMD)."""
+
+MOST_IN_SHARD = 10_000
+"""A shard is written whole and its record read whole; a megabyte of record is enough."""
 
 __all__ = ["SHARD_SIZE", "convert"]
 
@@ -81,16 +84,17 @@ def convert(
     for name, value in (("workers", workers), ("shard_size", shard_size), ("limit", 1 if limit is None else limit)):
         if value < 1:
             raise ValueError(f"{name} must be 1 or more, got {value}.")
+    if shard_size > MOST_IN_SHARD:
+        raise ValueError(f"shard_size must be at most {MOST_IN_SHARD}, got {shard_size}.")
     out = Path(out)
-    tasks = make_plan(
-        SOURCES[source], list(map(str, paths)), out, shard_size=shard_size, limit=limit, skip_bad=skip_bad
-    )
+    inputs = find_inputs(SOURCES[source], named := list(map(str, paths)))
     options = {"shard_size": shard_size, "limit": limit, "split": split}
-    manifest = Manifest(source, options, digest(tasks), list(map(str, paths)))
+    manifest = Manifest(source, options, digest(inputs), named)
     out.mkdir(parents=True, exist_ok=True)
     with _locked(out):
         store = _opened(out) if _resume(out, manifest) else None
         if store is None:
+            tasks = make_plan(SOURCES[source], inputs, out, shard_size=shard_size, limit=limit, skip_bad=skip_bad)
             _make_missing(tasks, workers, out.name, show_progress)
             manifest = _completed(manifest, [path for task in tasks for path in task.paths()])
             write_card(out, manifest)
@@ -120,9 +124,15 @@ def _resume(out: Path, manifest: Manifest) -> bool:
             raise SceneError(f"{out}: holds {foreign[0]!r} and no store; give a new or empty folder.")
         write_manifest(out, manifest)
     before = read_manifest(out)
-    there, here = ({"source": each.source, **each.options, "plan": each.plan} for each in (before, manifest))
+    there, here = ({"source": each.source, **each.options} for each in (before, manifest))
     if differ := differences(there, here):
         raise SceneError(f"{out}: holds another conversion ({differ}); give another folder, or remove this one.")
+    if before.plan != manifest.plan:
+        raise SceneError(
+            f"{out}: holds a conversion of other inputs: {', '.join(before.named)}; asked for is "
+            f"{', '.join(manifest.named)}. Inputs are known by their paths as they are found and by their sizes: name "
+            "them in the same way, give another folder, or remove this one."
+        )
     for leftover in out.glob(f"{PARTIAL_PREFIX}*"):
         leftover.unlink()
     return before.complete

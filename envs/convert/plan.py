@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import astuple, dataclass, field
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 
 from envs.scene import SceneError
 from envs.shards import SUFFIX
@@ -15,6 +16,18 @@ from envs.sources import Source
 
 BYTES_PER_SCENE = 1_000_000
 """Of a raw WOMD file; a first guess at the scenes of an input that only reading could count."""
+
+
+class Input(NamedTuple):
+    """One input.
+
+    Attributes:
+        name: the file, or what a generator is told.
+        size: its bytes; a file of another size is another file.
+    """
+
+    name: str
+    size: int
 
 
 @dataclass(frozen=True)
@@ -78,8 +91,17 @@ class Task:
             yield self.path(part)
 
 
+def find_inputs(source: Source, paths: Sequence[str]) -> list[Input]:
+    """What the user named, one by one; nothing is read of it.
+
+    Raises:
+        SceneError: nothing there.
+    """
+    return [Input(name, source.size(name)) for name in source.find(paths)]
+
+
 def make_plan(
-    source: Source, paths: Sequence[str], out: Path, *, shard_size: int, limit: int | None, skip_bad: bool
+    source: Source, inputs: Sequence[Input], out: Path, *, shard_size: int, limit: int | None, skip_bad: bool
 ) -> list[Task]:
     """Tasks in the order of the store; they depend on the inputs and options alone.
 
@@ -88,21 +110,21 @@ def make_plan(
 
     Args:
         source: of the inputs.
-        paths: what the user named.
+        inputs: see :func:`find_inputs`.
         out: folder of the store.
         shard_size: most records of a shard.
         limit: take only so many records, the first ones (inputs that cannot be counted are then read to count them).
         skip_bad: note records that give no scene instead of failing.
 
     Raises:
-        SceneError: nothing there, or an input that cannot be opened.
+        SceneError: no scenes, or an input that cannot be opened.
     """
     groups: list[list[Piece]] = []
     room, left = 0, limit
-    for name in source.find(paths):
-        size, count = source.size(name), source.count(name)
+    for name, size in inputs:
+        count = source.count(name)
         if left is not None:
-            count = min(left, count) if count is not None else sum(1 for _ in islice(source.records(name), left))
+            count = min(left, count) if count is not None else _count(source, name, left, skip_bad)
             left -= count
         if count is None:
             groups.append([Piece(name, size, 0, None)])
@@ -117,8 +139,22 @@ def make_plan(
         if left == 0:
             break
     if not groups:
-        raise SceneError(f"{', '.join(paths)}: no scenes in there; give inputs of the source {source.name}.")
+        named = ", ".join(name for name, _ in inputs[:5])
+        raise SceneError(f"{named}: no scenes in there; give inputs of the source {source.name}.")
     return [Task(source.name, number, tuple(pieces), out, shard_size, skip_bad) for number, pieces in enumerate(groups)]
+
+
+def _count(source: Source, name: str, most: int, skip_bad: bool) -> int:
+    """Records of an input, up to some number; where the rest cannot be read it counts as one that is bad."""
+    counted = 0
+    try:
+        for _ in islice(source.records(name), most):
+            counted += 1
+    except SceneError:
+        if not skip_bad:
+            raise
+        counted += 1
+    return counted
 
 
 def _cuts(count: int, room: int, shard_size: int) -> Iterator[tuple[int, int]]:
@@ -130,7 +166,6 @@ def _cuts(count: int, room: int, shard_size: int) -> Iterator[tuple[int, int]]:
         start, room = stop, 0
 
 
-def digest(tasks: Sequence[Task]) -> str:
-    """What makes the plan this one: the inputs, their sizes and their order."""
-    pieces = [astuple(piece) for task in tasks for piece in task.pieces]
-    return hashlib.sha256(json.dumps(pieces).encode()).hexdigest()
+def digest(inputs: Sequence[Input]) -> str:
+    """What makes the plan this one, beside the options: the inputs, their sizes and their order."""
+    return hashlib.sha256(json.dumps(inputs).encode()).hexdigest()

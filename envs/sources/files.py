@@ -32,7 +32,7 @@ def find_files(paths: Sequence[str], *patterns: str) -> list[str]:
 
     Args:
         paths: a file is taken whatever its name; a folder gives the files below it whose name fits one of ``patterns``;
-            anything else must be a pattern that matches something. Local paths or addresses.
+            anything else must be a pattern that matches something, files or folders. Local paths or addresses.
         patterns: shell patterns of file names.
 
     Raises:
@@ -54,7 +54,11 @@ def _find_local(path: str, patterns: Sequence[str]) -> tuple[list[str], bool]:
     """Files, and whether the path is a folder."""
     if Path(path).is_dir():
         return sorted({str(f) for pattern in patterns for f in Path(path).rglob(pattern) if f.is_file()}), True
-    return ([path] if Path(path).is_file() else sorted(glob.glob(path, recursive=True))), False
+    if Path(path).is_file():
+        return [path], False
+    matches = sorted(glob.glob(path, recursive=True))
+    # Of a recursive pattern a folder matches beside the files in it.
+    return list(dict.fromkeys(file for match in matches for file in _find_local(match, patterns)[0])), False
 
 
 def _find_remote(path: str, patterns: Sequence[str]) -> tuple[list[str], bool]:
@@ -63,10 +67,12 @@ def _find_remote(path: str, patterns: Sequence[str]) -> tuple[list[str], bool]:
         if system.isfile(inner):
             return [path], False
         is_folder = system.isdir(inner)
-        names = system.find(inner) if is_folder else system.glob(inner)
-        if is_folder:
-            names = [name for name in names if any(fnmatch(PurePosixPath(name).name, pattern) for pattern in patterns)]
-        return sorted(system.unstrip_protocol(name) for name in names), is_folder
+        names = []
+        for match in [inner] if is_folder else sorted(system.glob(inner)):
+            below = system.find(match) if system.isdir(match) else []
+            fitting = [name for name in below if any(fnmatch(PurePosixPath(name).name, each) for each in patterns)]
+            names += sorted(fitting) if system.isdir(match) else [match]
+        return list(dict.fromkeys(map(system.unstrip_protocol, names))), is_folder
 
 
 def file_size(path: str) -> int:

@@ -1,4 +1,4 @@
-"""GPUDrive (and Nocturne) JSON of WOMD scenes, one scene in a file: ``.json``, ``.json.gz`` or ``.json.xz``.
+"""GPUDrive JSON of WOMD scenes, one scene in a file: ``.json``, ``.json.gz`` or ``.json.xz``.
 
 Two dialects are about. The newer one has ids, radians and a ``metadata`` entry that names the SDC and the tracks to
 predict. The older one has none of them: headings are degrees, the SDC is the last object, no track is marked for
@@ -14,13 +14,14 @@ import math
 import zlib
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from envs.scene import LOG_STEPS, AgentKind, Lacks, LightState, MapKind, Scene, SceneError
+from envs.scene import LANE_KINDS, LOG_STEPS, AgentKind, Lacks, LightState, MapKind, Scene, SceneError
 from envs.sources.fields import Field, decode_json, one_line
 from envs.sources.files import find_files, read_file
 from envs.sources.recording import KIND_OF_FEATURE, LightListing, Polyline, Recording
@@ -40,7 +41,9 @@ _MOVING_SPEED = 1.0
 def read_gpudrive(path: str | Path) -> Scene:
     """The scene of one GPUDrive JSON file, validated.
 
-    Ids that the file lacks are positions in its lists. Invalid steps may hold anything (-10000 and 0.0001 occur).
+    Tracks without an id have their place in the list for one, map features a negative number. Lights name lanes by id:
+    where the map has none, a light belongs to the lane that begins nearest to where it stops traffic. Invalid steps may
+    hold anything (-10000 and 0.0001 occur).
 
     Raises:
         SceneError: naming the file: not JSON, an entry missing or of the wrong type, not 91 steps, no SDC, and all that
@@ -73,6 +76,8 @@ def scene_from_json(top: Field, notes: Notes | None = None) -> Scene:
     heading = np.array([_steps(item, "heading", partial(Field.number, finite=False)) for item in objects])
     extent = np.array([[item[side].number() for side in ("length", "width", "height")] for item in objects])
     metadata = top.get("metadata")
+    polylines = [_polyline(road, index, notes) for index, road in enumerate(top["roads"].items())]
+    lights = [listing for light in top["tl_states"].entries() for listing in _listings(light, notes)]
     return Recording(
         scene_id=top["scenario_id"].text(),
         position=np.stack([_table(item, "position", "x", "y", "z") for item in objects]),
@@ -84,8 +89,8 @@ def scene_from_json(top: Field, notes: Notes | None = None) -> Scene:
         track_id=[_id(item, index) for index, item in enumerate(objects)],
         sdc=len(objects) - 1 if metadata is None else metadata["sdc_track_index"].integer(),
         predict=[] if metadata is None else _predicted(metadata),
-        polylines=[_polyline(road, index, notes) for index, road in enumerate(top["roads"].items())],
-        lights=[listing for light in top["tl_states"].entries() for listing in _listings(light, notes)],
+        polylines=polylines,
+        lights=lights if any(line.feature_id >= 0 for line in polylines) else _tied(lights, polylines),
         lacks=_LACKS | (Lacks.TARGETS if metadata is None else Lacks.NOTHING),
     ).to_scene(top.name)
 
@@ -147,7 +152,7 @@ def _agent_kind(field: Field, notes: Notes) -> AgentKind:
 
 
 def _polyline(road: Field, index: int, notes: Notes) -> Polyline:
-    return Polyline(_id(road, index), _map_kind(road, notes), road["geometry"].table("x", "y", "z"))
+    return Polyline(_id(road, -1 - index), _map_kind(road, notes), road["geometry"].table("x", "y", "z"))
 
 
 def _map_kind(road: Field, notes: Notes) -> MapKind:
@@ -174,6 +179,16 @@ def _listings(light: Field, notes: Notes) -> Iterator[LightListing]:
     for step, state, x, y, z in zip(*columns.values(), strict=True):
         point = (x.number(), y.number(), z.number())
         yield LightListing(step.integer(highest=LOG_STEPS - 1), lane, _light_state(state, notes), point)
+
+
+def _tied(lights: list[LightListing], polylines: list[Polyline]) -> list[LightListing]:
+    """Lights of a map without ids, each tied to the lane that begins nearest to its first stop point."""
+    starts = {line.feature_id: line.points[0] for line in polylines if line.kind in LANE_KINDS and len(line.points)}
+    nearest: dict[int, int] = {}
+    for light in lights if starts else ():
+        if light.lane_id not in nearest:
+            nearest[light.lane_id] = min(starts, key=lambda lane: math.dist(starts[lane][:2], light.stop_point[:2]))
+    return [replace(light, lane_id=nearest.get(light.lane_id, light.lane_id)) for light in lights]
 
 
 def _light_state(field: Field, notes: Notes) -> LightState:

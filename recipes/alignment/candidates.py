@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -51,7 +53,6 @@ class Group(NamedTuple):
     sides: str = "pairs"
 
 
-Candidates = list[Group]
 SIDES = {
     "pairs": "pairs",
     "best": "targets",
@@ -64,6 +65,15 @@ SIDES = {
 two sets of any sizes, or one ranking, whose nearer half is the preferred side and the rest the unpreferred one."""
 RANKED = ("pairs", "best", "sets", "ranking")
 """Those of them that read ranks."""
+READ = {
+    "pairs": ("rank_by", "pairs", "num", "margin", "rankings_per_scene"),
+    "best": ("rank_by", "num"),
+    "sets": ("rank_by", "num", "num_unpreferred"),
+    "ranking": ("rank_by", "num"),
+    "adversarial": ("num",),
+    "expert": ("num",),
+}
+"""Options of each beside ``kind``."""
 PAIRS = ("nearest_farthest", "random", "all")
 """Ways to pair the rollouts of a group."""
 
@@ -85,7 +95,7 @@ def make_candidates(
     expert: PreferenceStore | None = None,
     among: Collection[int] | None = None,
 ) -> Candidates:
-    """Candidates of the scenes of a store.
+    """Choose rollouts of the scenes of a store.
 
     Args:
         data: ``kind`` (one of :data:`SIDES`), ``rank_by`` (``distance`` or ``ade``; for :data:`RANKED` ones) and
@@ -105,7 +115,7 @@ def make_candidates(
         among: indices of the scenes to take; all by default.
 
     Returns:
-        Scenes that no pair is left of, or no token, are not among them.
+        Groups in the order of the store; scenes that no pair is left of are not among them.
 
     Raises:
         ValueError: an unknown kind, ranking or way to pair, more rollouts than the groups hold, nothing is left to
@@ -114,33 +124,68 @@ def make_candidates(
     data = check_data(data, store.provenance.num_rollouts)
     if data.kind == "expert":
         expert = _check_expert(data, store, expert)
-    contexts = Contexts(scenes, options)
     wanted = set(store.scenes.tolist() if among is None else among)
     rows = [row for row, scene in enumerate(store.scenes.tolist()) if scene in wanted]
-    groups = []
-    for row, chosen in zip(rows, _choose(data, store, rows, seed), strict=True):
-        if not len(chosen.preferred):
-            continue
-        scene = int(store.scenes[row])
-        context = contexts[scene]
-        ranked = store.read([row], num_agents=len(context.kind))[0]
-        group = _group(data, context, ranked, chosen)
-        if data.kind == "adversarial":
-            log = log_item(context, tokenizer)
-            group = _against(group, log.tokens.expand(data.num, -1, -1), log.token_valid)
-        elif data.kind == "expert":
-            played = expert.read([_row_of(expert, scene)], num_agents=len(context.kind))[0]
-            drawn = random_rollouts(
-                1, len(played[keys.TOKENS]), data.num, make_generator(seed, "expert_rollouts", scene)
-            )[0]
-            group = _against(group, played[keys.TOKENS][drawn], played[keys.TOKEN_VALID])
-        groups.append(group)
-    if not (kept := [group for group in groups if group.token_valid.any()]):
+    chosen = zip(rows, _choose(data, store, rows, seed), strict=True)
+    left = {row: each for row, each in chosen if len(each.preferred)}
+    candidates = Candidates(data, store, left, Contexts(scenes, options), tokenizer, seed, expert)
+    if not any(group.token_valid.any() for group in candidates):
         raise ValueError(
             f"none of the {len(rows)} scenes of {store.folder} has anything to learn from; raise "
             "method.data.rankings_per_scene, or take more scenes."
         )
-    return kept
+    return candidates
+
+
+@dataclass(frozen=True)
+class Candidates(Sequence[Group]):
+    """What a method may learn from, by scene: read when a step asks for it, whatever the size of the data set.
+
+    Attributes:
+        data: options, shares as whole numbers.
+        store: ranked rollouts.
+        chosen: rollouts of a scene by its row in the store.
+        contexts: of the scenes.
+        tokenizer: for the tokens of logs.
+        seed: of what is drawn of an expert's rollouts.
+        expert: rollouts of an expert.
+    """
+
+    data: DictConfig
+    store: PreferenceStore
+    chosen: Mapping[int, Chosen]
+    contexts: Contexts
+    tokenizer: MotionTokenizer
+    seed: int
+    expert: PreferenceStore | None
+
+    def __len__(self) -> int:
+        return len(self.chosen)
+
+    def __getitem__(self, index: int) -> Group:
+        row = self._rows[index]
+        scene = int(self.store.scenes[row])
+        context = self.contexts[scene]
+        agents = len(context.kind)
+        group = _group(self.data, context, self.store.read([row], num_agents=agents)[0], self.chosen[row])
+        if self.data.kind == "adversarial":
+            log = log_item(context, self.tokenizer)
+            return _against(group, log.tokens.expand(self.data.num, -1, -1), log.token_valid)
+        if self.data.kind == "expert":
+            played = self.expert.read([_row_of(self.expert, scene)], num_agents=agents)[0]
+            draw = make_generator(self.seed, "expert_rollouts", scene)
+            drawn = random_rollouts(1, len(played[keys.TOKENS]), self.data.num, draw)[0]
+            return _against(group, played[keys.TOKENS][drawn], played[keys.TOKEN_VALID])
+        return group
+
+    @cached_property
+    def _rows(self) -> list[int]:
+        return list(self.chosen)
+
+    @property
+    def counts(self) -> set[int]:
+        """Numbers of pairs, or of preferred rollouts, that scenes have."""
+        return {len(each.preferred) for each in self.chosen.values()}
 
 
 def _group(data: DictConfig, context: SceneContext, ranked: TensorDict, chosen: Chosen) -> Group:
@@ -162,8 +207,8 @@ def _choose(data: DictConfig, store: PreferenceStore, rows: list[int], seed: int
     """Rollouts of some scenes, whatever others the store holds; M and N may differ among scenes for pairs only."""
     if data.kind not in RANKED:
         held = store.provenance.num_rollouts
-        draws = [make_generator(seed, data.kind, scene) for scene in store.scenes[rows].tolist()]
-        drawn = [random_rollouts(1, held, data.num, draw)[0] for draw in draws]
+        draws = (make_generator(seed, data.kind, scene) for scene in store.scenes[rows].tolist())
+        drawn = (random_rollouts(1, held, data.num, draw)[0] for draw in draws)
         return [Chosen(each, each) for each in drawn]
     distance = (store.distance if data.rank_by == keys.DISTANCE else store.ade)[rows]
     if data.kind == "pairs":
@@ -231,7 +276,7 @@ def check_data(data: DictConfig, held: int) -> DictConfig:
         The options, shares of the rollouts as whole numbers.
 
     Raises:
-        ValueError: an unknown kind, ranking or way to pair, or more rollouts than there are.
+        ValueError: an unknown kind, option, ranking or way to pair, or more rollouts than there are.
     """
     counted = _counted(data, held)
     _check(counted, held, data)
@@ -256,6 +301,11 @@ def _asked(given: DictConfig, data: DictConfig, name: str) -> str:
 def _check(data: DictConfig, held: int, given: DictConfig) -> None:
     if data.kind not in SIDES:
         raise ValueError(f"method.data.kind must be one of {', '.join(SIDES)}, got {data.kind!r}.")
+    if unread := sorted(set(map(str, data)) - {"kind", *READ[data.kind]}):
+        raise ValueError(
+            f"method.data.{unread[0]} says nothing to method.data.kind={data.kind}, which takes "
+            f"{', '.join(READ[data.kind])}; leave it out (~method.data.{unread[0]})."
+        )
     if data.kind in RANKED and data.rank_by not in (keys.DISTANCE, keys.ADE):
         raise ValueError(f"method.data.rank_by must be distance or ade, got {data.rank_by!r}.")
     if data.kind == "pairs" and data.pairs not in PAIRS:

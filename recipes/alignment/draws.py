@@ -44,7 +44,7 @@ def parts_of(
     weights = [1 if group.unpreferred is not None else int(group.token_valid.sum()) for group in groups]
     mine = ranks.mine(range(len(groups)))
     for part in micro_batches([_rows(drawn[i]) for i in mine], options.max_rows):
-        share = sum(weights[mine[i]] for i in part) / sum(weights)
+        share = sum(weights[mine[i]] for i in part) / max(1, sum(weights))
         yield make_batch([drawn[mine[i]] for i in part]).to(device), share
 
 

@@ -55,8 +55,8 @@ def make_probes(
     pairs: int,
     rows: Iterable[int] | None = None,
     rank_by: str = keys.DISTANCE,
-) -> list[Probe]:
-    """Probes from ranked rollouts.
+) -> Iterator[Probe]:
+    """Probes from ranked rollouts, one by one.
 
     Args:
         store: of rollouts, ranked by the distance that is asked about.
@@ -67,24 +67,14 @@ def make_probes(
         rows: of the store; all by default.
         rank_by: ``distance`` or ``ade``, which decides what is near.
     """
-    contexts = Contexts(scenes, options)
+    contexts = Contexts(scenes, options, most=1)  # each is asked about once
     near, far = nearest_farthest(store.distance if rank_by == keys.DISTANCE else store.ade, pairs)
-    probes = []
     for row in range(len(store)) if rows is None else rows:
         context = contexts[int(store.scenes[row])]
         group = store.read([row], num_agents=len(context.kind))[0]
         log, tokens = log_item(context, tokenizer), group[keys.TOKENS]
-        probes.append(
-            Probe(
-                context,
-                log.tokens[0],
-                log.token_valid,
-                tokens[near[row]],
-                tokens[far[row]],
-                group[keys.TOKEN_VALID],
-            )
-        )
-    return probes
+        sides = tokens[near[row]], tokens[far[row]]
+        yield Probe(context, log.tokens[0], log.token_valid, *sides, group[keys.TOKEN_VALID])
 
 
 @torch.no_grad()
@@ -194,7 +184,7 @@ def divergence(
         memory: GiB for rollouts.
         device: of both.
     """
-    contexts = Contexts(scenes, options)
+    contexts = Contexts(scenes, options, most=1)  # each is asked about once
     batches = make_collector(
         scenes,
         model,

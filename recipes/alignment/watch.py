@@ -58,7 +58,7 @@ class Look:
         rows = range(min(options.watch_scenes, len(store)))
         pairs = min(options.watch_pairs, store.provenance.num_rollouts // 2)
         tokenizer = copy.deepcopy(model.tokenizer).cpu()  # logs are read on the CPU, wherever the model is
-        self.probes = make_probes(store, watch.scenes, context, tokenizer, pairs, rows)
+        self.probes = list(make_probes(store, watch.scenes, context, tokenizer, pairs, rows))
         reference, _, _ = open_policy(watch.reference)
         self.model, self.reference = model, reference.to(next(model.parameters()).device)
 
@@ -99,7 +99,7 @@ class ImitationLook:
         pairs = min(options.watch_pairs, store.provenance.num_rollouts // 2)
         tokenizer = copy.deepcopy(model.tokenizer).cpu()  # logs are read on the CPU, wherever the model is
         kept = list(islice(rows, options.watch_scenes))
-        self.probes = make_probes(store, scenes, context, tokenizer, pairs, kept, rank_by)
+        self.probes = list(make_probes(store, scenes, context, tokenizer, pairs, kept, rank_by))
         self.model = model
 
     def __call__(self, device: str) -> dict[str, float]:

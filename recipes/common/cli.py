@@ -111,6 +111,8 @@ def check_resources(cfg: DictConfig) -> None:
     keep_freed_memory()
     if torch.device(cfg.device).type == "cuda" and not torch.cuda.is_available():
         raise ValueError(f"device={cfg.device}: torch {torch.__version__} finds no GPU here; say device=cpu.")
+    if (index := torch.device(cfg.device).index) is not None and index >= torch.cuda.device_count():
+        raise ValueError(f"device={cfg.device}: there are {torch.cuda.device_count()} GPUs, counted from 0.")
 
 
 def check_steps(section: DictConfig, name: str) -> None:

@@ -60,13 +60,14 @@ LIMITS: dict[str, Limit] = {
     "grid": Limit(float, many=True),
     "has_lights": FLAG._replace(empty=True),
     "rankings_per_scene": Limit(float, empty=True),
+    "collection.workers": Limit(dict),
     "seeds": Limit(int, many=True),
     "snapshots": COUNT._replace(many=True),
 }
 """Limit of an option by its last name, or by its last two where one name has several meanings."""
 CLOSED = (
     *("", "pretraining", "collection", "alignment", "evaluation", "decoding", "pictures", "experiment", "logger"),
-    *("training", "method", "model"),
+    *("training", "method", "model", "scenes"),
 )
 """Sections whose options all stand in their YAML; ``""`` is the recipe itself."""
 GROUPS = Path(__file__).parents[1] / "config"

@@ -106,7 +106,7 @@ def policies_of(cfg: DictConfig) -> dict[str, Path]:
     paths = [cfg.policies] if isinstance(cfg.policies, str) else list(cfg.policies)
     if not paths:
         raise ValueError("policies=[] names no policy; say for example policies=[runs/pretrain/policy.pt].")
-    names = [Path(path).parent.name for path in paths]
+    names = [Path(path).absolute().parent.name for path in paths]
     return dict(zip(names if len({*names}) == len(names) else paths, map(Path, paths), strict=True))
 
 

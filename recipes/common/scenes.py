@@ -50,11 +50,11 @@ def open_splits(cfg: DictConfig) -> Splits:
     Raises:
         ValueError: fewer training scenes than ``tune`` asks for, or scenes that are in two splits.
     """
-    train, held_out = (_chosen(_open(cfg, cfg[split]), cfg.select, split) for split in ("train", "eval"))
+    train, held_out = (_chosen(_open(cfg, split), cfg.select, split) for split in ("train", "eval"))
     if isinstance(cfg.tune, int):
         train, tune = _drawn(train, cfg.tune, cfg.split_seed)
     else:
-        tune = _chosen(_open(cfg, cfg.tune), cfg.select, "tune")
+        tune = _chosen(_open(cfg, "tune"), cfg.select, "tune")
     for (one, first), (other, second) in combinations({"train": train, "tune": tune, "eval": held_out}.items(), 2):
         if shared := sorted(set(first.scene_ids) & set(second.scene_ids)):
             raise ValueError(
@@ -89,7 +89,11 @@ def _chosen(scenes: SceneStore, select: DictConfig, split: str) -> SceneStore:
     return chosen
 
 
-def _open(cfg: DictConfig, paths: str | ListConfig) -> SceneStore:
+def _open(cfg: DictConfig, split: str) -> SceneStore:
+    paths = cfg[split]
+    if not isinstance(paths, str | ListConfig):
+        number = "a number of training scenes, " if split == "tune" else ""
+        raise ValueError(f"scenes.{split} must be {number}a path or a list of paths, got {paths!r}.")
     inputs = [paths] if isinstance(paths, str) else list(paths)
     if cfg.source == "store":
         return SceneStore(*inputs)

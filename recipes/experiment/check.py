@@ -14,8 +14,9 @@ from dpa.report.table import REFERENCE
 from dpa.tokens import VerletTokenizer
 from recipes.alignment.candidates import check_data
 from recipes.alignment.losses import check_fit, make_loss
+from recipes.collect import check_collection
 from recipes.common.cli import check_steps, told_of
-from recipes.common.limits import check_limits
+from recipes.common.limits import GROUPS, check_limits
 from recipes.common.models import policy_config
 from recipes.common.rankings import build_distance, ranking_options
 from recipes.experiment.methods import read_setups
@@ -23,6 +24,10 @@ from recipes.experiment.summary import labels
 
 CHECKPOINTS = ("last", "select", "all")
 """What becomes of the snapshots of an alignment: there are none, one of them may be chosen, or each is shown."""
+OWN = ("run/default.yaml", "comparison.yaml", "experiment/base.yaml")
+"""Where the options stand that an experiment has beside its :data:`SECTIONS`."""
+SECTIONS = ("logger", "pretraining", "collection", "alignment", "evaluation")
+AXIS = ("name", "values", "log")
 
 
 def check_experiment(cfg: DictConfig) -> None:
@@ -34,6 +39,7 @@ def check_experiment(cfg: DictConfig) -> None:
     Raises:
         ValueError: naming the option.
     """
+    _check_keys(cfg)
     check_limits(cfg)
     check_steps(cfg.pretraining, "pretraining")
     policy_config(cfg.model)
@@ -41,9 +47,24 @@ def check_experiment(cfg: DictConfig) -> None:
     if not cfg.seeds or len(set(cfg.seeds)) < len(cfg.seeds):
         raise ValueError(f"seeds must be one or more, each once, got {list(cfg.seeds)}.")
     _check_decodings(cfg)
+    check_collection(cfg.collection)
     _check_rankings(cfg)
     _check_methods(cfg)
     _check_report(cfg)
+
+
+def _check_keys(cfg: DictConfig) -> None:
+    """Refuse what a YAML of one's own adds where nobody reads it; Hydra refuses it on the command line alone."""
+    known = OmegaConf.merge(*(OmegaConf.load(GROUPS / name) for name in OWN))
+    for section in SECTIONS:
+        own = OmegaConf.load(GROUPS / section / "default.yaml")
+        known[section] = OmegaConf.merge(own, {"ranking": {}}) if section == "collection" else own
+    for section in ("", "decoding", "pictures", "experiment", *SECTIONS):
+        given, taken = (set(OmegaConf.select(each, section) if section else each) for each in (cfg, known))
+        taken = taken - {"defaults", "hydra"} | ({"scenes", "model", "methods"} if not section else set())
+        if unknown := sorted(given - taken):
+            where = section or "the experiment"
+            raise ValueError(f"{where} has no option {unknown[0]!r}; it takes {', '.join(sorted(taken))}.")
 
 
 def _check_decodings(cfg: DictConfig) -> None:
@@ -76,6 +97,11 @@ def _check_rankings(cfg: DictConfig) -> None:
 def _check_methods(cfg: DictConfig) -> None:
     model = MotionLM("nano", VerletTokenizer())  # any will do: a loss is made to see its options refused
     for name, setup in read_setups(cfg).items():
+        if unknown := sorted(set(cfg.methods[name]) - {"name", "data", "loss"}):
+            raise ValueError(
+                f"methods.{name} has no option {unknown[0]!r}; it takes name, data and loss; what else sets it apart "
+                f"stands in experiment.setup.{name}."
+            )
         with told_of(f"methods.{name}"):
             check_fit(cfg.methods[name])
             check_data(cfg.methods[name].data, cfg.collection.num_rollouts)
@@ -85,6 +111,31 @@ def _check_methods(cfg: DictConfig) -> None:
             raise ValueError(f"experiment.setup.{name}.alignment has no option {unknown[0]!r}.")
         with told_of(f"methods.{name}"):
             check_steps(setup.merged(cfg.alignment), "alignment")
+
+
+def _check_texts(experiment: DictConfig) -> None:
+    """Titles and labels are text, which YAML takes for numbers where they look like them."""
+    texts = {name: experiment[name] for name in ("name", "title", "question")}
+    texts |= {} if experiment.paper is None else {"paper": experiment.paper}
+    texts |= {f"labels.{name}": label for name, label in experiment.labels.items()}
+    for name, text in texts.items():
+        if not isinstance(text, str):
+            raise ValueError(f"experiment.{name} must be text, got {text!r}; put it in quotes.")
+
+
+def _check_axis(cfg: DictConfig) -> None:
+    axis = cfg.experiment.axis
+    if axis is None:
+        return
+    if not OmegaConf.is_dict(axis) or set(axis) != set(AXIS) or not OmegaConf.is_dict(axis["values"]):
+        raise ValueError(f"experiment.axis must have {', '.join(AXIS)}, got {axis}; or say null.")
+    for method, value in axis["values"].items():
+        if method not in cfg.methods:
+            raise ValueError(f"experiment.axis.values.{method} is no method; name one of {', '.join(cfg.methods)}.")
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ValueError(f"experiment.axis.values.{method} must be a number, got {value!r}.")
+    if not isinstance(axis["name"], str) or not isinstance(axis["log"], bool):
+        raise ValueError(f"experiment.axis: name must be text and log true or false, got {axis}.")
 
 
 def _check_labels(cfg: DictConfig) -> None:
@@ -100,6 +151,8 @@ def _check_labels(cfg: DictConfig) -> None:
 
 def _check_report(cfg: DictConfig) -> None:
     experiment = cfg.experiment
+    _check_texts(experiment)
+    _check_axis(cfg)
     if not re.fullmatch(r"\w[\w.-]*", str(experiment.name)):
         raise ValueError(
             f"experiment.name={experiment.name!r} names a file and a place on the page; say it in letters, digits, _, "

@@ -6,6 +6,7 @@ clock, which does not see what a killed process had done.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import asdict
 from pathlib import Path
 
@@ -47,7 +48,7 @@ def collect_job(cfg: DictConfig, seed: int, split: str, source: str) -> dict[str
     distance = TimedDistance(build_distance(cfg.collection.ranking, "collection.ranking"))
     drawn, folder = drawing_seed(cfg, seed, source), runs.preferences(seed, split, source)
     collect(cfg, scenes, runs.policy(seed, source), drawn, folder, indices, distance)
-    return {"rank": distance.seconds}
+    return {"rank": distance.seconds} if cfg.collection.workers.backend == "local" else {}
 
 
 def learnt_from(cfg: DictConfig, num_scenes: int) -> list[int] | None:
@@ -119,11 +120,11 @@ def likelihood_job(cfg: DictConfig, seed: int, policy: str, split: str) -> None:
     }
     if finished(path, decided_by) is not None:
         return
-    probes = make_probes(store, scenes, options, model.tokenizer.cpu(), pairs)
-    if len(probes) != len(scenes):
+    if len(store) != len(scenes):
         raise ValueError(
-            f"{store.folder} holds {len(probes)} of {len(scenes)} scenes; run the same command again to fill it."
+            f"{store.folder} holds {len(store)} of {len(scenes)} scenes; run the same command again to fill it."
         )
+    probes = make_probes(store, scenes, options, copy.deepcopy(model.tokenizer).cpu(), pairs)
     found = probe(model.to(cfg.device), reference.to(cfg.device), probes, cfg.device)
     drift = divergence(
         model,

@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from dpa.report.table import REFERENCE
 from envs.seeding import derive_seed
+from recipes.alignment.candidates import RANKED
 from recipes.common.cli import build
 from recipes.experiment.runs import SNAPSHOT
 
@@ -113,6 +114,11 @@ def read_setups(cfg: DictConfig) -> dict[str, Setup]:
         if setup.ranking is not None and setup.ranking not in cfg.rankings:
             raise ValueError(
                 f"experiment.setup.{name}.ranking={setup.ranking!r} is not among rankings: {', '.join(cfg.rankings)}."
+            )
+        if setup.ranking is not None and cfg.methods[name].data.kind not in RANKED:
+            raise ValueError(
+                f"experiment.setup.{name}.ranking={setup.ranking} says nothing to methods.{name}.data.kind="
+                f"{cfg.methods[name].data.kind}, which reads no ranks; leave it out."
             )
     return {name: setups[name] for level in levels(setups) for name in level}
 

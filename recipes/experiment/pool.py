@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from itertools import islice
 from typing import Any, NamedTuple
 
 import torch
 
+from envs.allocator import keep_freed_memory
 from envs.progress import message, progress, stage, use_line
 from envs.workers import end_with_parent
 
@@ -35,15 +38,16 @@ class Workers:
     Args:
         count: processes; with 1 the jobs run in this one.
         threads: of torch in each worker.
+        spread: give each worker one of the GPUs, in turn.
 
     Raises:
         ValueError: no worker.
     """
 
-    def __init__(self, count: int, threads: int) -> None:
+    def __init__(self, count: int, threads: int, *, spread: bool = False) -> None:
         if count < 1:
             raise ValueError(f"workers must be 1 or more, got {count}.")
-        self.count, self.threads = count, threads
+        self.count, self.threads, self.spread = count, threads, spread
         self._pool: ProcessPoolExecutor | None = None
 
     def __enter__(self) -> Workers:
@@ -52,12 +56,13 @@ class Workers:
             context = multiprocessing.get_context("spawn")
             started, lock = context.Value("i", 0), context.RLock()
             use_line(0, lock)
-            self._pool = ProcessPoolExecutor(self.count, context, _start, (lock, started))
+            gpus = _gpus() if self.spread else []
+            self._pool = ProcessPoolExecutor(self.count, context, _start, (lock, started, gpus))
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
+            self._pool.shutdown()
 
     def run(self, jobs: list[Job], name: str) -> Iterator[tuple[str, float, Any]]:
         """Run jobs, as many at a time as there are workers; gives name, seconds and result of each as it ends.
@@ -75,35 +80,46 @@ class Workers:
             for job in progress(jobs, name, unit="job"):
                 yield job.name, *_work(job, self.threads)
             return
-        futures = {self._pool.submit(_work, job, self.threads): job.name for job in jobs}
+        waiting, running = iter(jobs), dict[Future, str]()
         failed: BaseException | None = None
         with progress(total=len(jobs), description=name, unit="job") as bar:
-            for future in as_completed(futures):
-                if future.cancelled():
-                    continue
-                error = future.exception()
-                if error is None:
-                    yield futures[future], *future.result()
-                elif isinstance(error, BrokenProcessPool):
-                    raise ChildProcessError(
-                        f"a worker of {name!r} was killed, perhaps for want of memory; run it again with workers=1."
-                    ) from error
-                elif failed is None:
-                    failed = error
-                    message(f"{futures[future]}: {failed} (jobs under way end first)")
-                    for other in futures:
-                        other.cancel()
-                bar.update()
+            while True:
+                # A pool starts whatever it has been handed, even when it is told to stop: so no more than it has hands.
+                for job in islice(waiting, 0 if failed else self.count - len(running)):
+                    running[self._pool.submit(_work, job, self.threads)] = job.name
+                if not running:
+                    break
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    job_name, error = running.pop(future), future.exception()
+                    if error is None:
+                        yield job_name, *future.result()
+                    elif isinstance(error, BrokenProcessPool):
+                        raise ChildProcessError(
+                            f"a worker of {name!r} was killed, perhaps for want of memory; run it again with workers=1."
+                        ) from error
+                    elif failed is None:
+                        failed = error
+                        message(f"{job_name}: {failed} (jobs under way end first)")
+                    bar.update()
         if failed is not None:
             raise failed
 
 
-def _start(lock: Any, started: Any) -> None:
-    """End with the parent, and draw on a line of the terminal of one's own, below the bar of all jobs."""
+def _gpus() -> list[str]:
+    """Names of the GPUs that this process may use."""
+    named = os.environ.get("CUDA_VISIBLE_DEVICES")
+    return named.split(",") if named else [str(number) for number in range(torch.cuda.device_count())]
+
+
+def _start(lock: Any, started: Any, gpus: list[str]) -> None:
+    """End with the parent, draw on a line of the terminal of one's own below the bar of all jobs, and see one GPU."""
     end_with_parent()
+    keep_freed_memory()
     with started.get_lock():
         started.value += 1
         use_line(started.value, lock)
+        if gpus:  # read when CUDA is first used, which it has not been here
+            os.environ["CUDA_VISIBLE_DEVICES"] = gpus[(started.value - 1) % len(gpus)]
 
 
 def _work(job: Job, threads: int) -> tuple[float, Any]:

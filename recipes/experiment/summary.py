@@ -100,7 +100,9 @@ class Results:
     def _row(self, method: str, run: Run, seed: int, split: str) -> dict[str, Any]:
         path = self.runs.evaluation(seed, run, split)
         found = read_json(path)["per_scene"]
-        values = {name: self._known(found[name]) if split == self.split else found[name] for name in SCENE_FIGURES}
+        values = {name: found[name] for name in SCENE_FIGURES}
+        if split == self.split:  # other figures are known of scenes that have no realism, and are told of all of them
+            values["realism"] = self._known(values["realism"])
         return {
             "method": method,
             "seed": seed,

@@ -115,7 +115,7 @@ def older_gpudrive() -> dict[str, Any]:
         "objects": [gpudrive_track(1000.0, 360.0), gpudrive_track(1020.0, -90.0)],
         "roads": [gpudrive_road(kind, xs) for kind, xs in roads],
         "tl_states": {
-            "0": {"state": ["stop", "arrow_go"], "x": [1.0, 2.0], "y": [0, 0], "z": [0, 0], "time_index": [4, 5]}
+            "117": {"state": ["stop", "arrow_go"], "x": [1.0, 2.0], "y": [0, 0], "z": [0, 0], "time_index": [4, 5]}
         },
     }
 

@@ -13,6 +13,7 @@ import sys
 import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import fsspec
@@ -105,7 +106,7 @@ def test_a_changed_input_is_another_plan(raw: Path, tmp_path: Path) -> None:
     convert("womd", [raw], tmp_path / "out")
     with (raw / "a.tfrecord").open("ab") as file:
         file.write(b"more")
-    with pytest.raises(SceneError, match="another conversion .'plan'"):
+    with pytest.raises(SceneError, match="of other inputs: .*known by their paths .* and by their sizes"):
         convert("womd", [raw], tmp_path / "out")
 
 
@@ -134,10 +135,12 @@ def test_limit_takes_the_first_scenes(raw: Path, tmp_path: Path) -> None:
     assert convert("womd", [raw], tmp_path / "out", limit=4).scene_ids == [f"scene{number}" for number in range(4)]
 
 
-def test_a_finished_conversion_is_only_opened(raw: Path, tmp_path: Path) -> None:
+def test_a_finished_conversion_is_only_opened(raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     convert("womd", [raw], tmp_path / "out")
     times = [path.stat().st_mtime_ns for path in sorted((tmp_path / "out").rglob("*"))]
-    convert("womd", [raw], tmp_path / "out")
+    with monkeypatch.context() as patched:
+        patched.setitem(SOURCES, "womd", replace(SOURCES["womd"], count=None))  # what would read every file to count
+        convert("womd", [raw], tmp_path / "out")
     assert [path.stat().st_mtime_ns for path in sorted((tmp_path / "out").rglob("*"))] == times
 
 
@@ -166,7 +169,7 @@ def test_another_conversion_is_not_mixed_in(raw: Path, tmp_path: Path) -> None:
     convert("womd", [raw], tmp_path / "out")
     with pytest.raises(SceneError, match="another conversion .'shard_size': 256 there, 3 here"):
         convert("womd", [raw], tmp_path / "out", shard_size=3)
-    with pytest.raises(SceneError, match="another conversion .'plan'"):
+    with pytest.raises(SceneError, match=r"conversion of other inputs: .*raw; asked for is .*a\.tfrecord"):
         convert("womd", [raw / "a.tfrecord"], tmp_path / "out")
     with pytest.raises(SceneError, match="holds 'a.tfrecord' and no store"):
         convert("womd", [raw], raw)
@@ -251,6 +254,21 @@ def test_a_store_with_gaps_is_not_passed_off_as_whole(raw: Path, tmp_path: Path)
     convert("womd", [raw], out, skip_bad=True)
     with pytest.raises(SceneError, match="made without a bad input"):
         convert("womd", [raw], out)
+
+
+def test_a_limit_takes_what_a_cut_file_still_holds(raw: Path, tmp_path: Path) -> None:
+    packed, whole = raw / "b.tfrecord.gz", (raw / "b.tfrecord-00000-of-00001").read_bytes()
+    packed.write_bytes(gzip.compress(whole[: len(whole) * 3 // 4]))
+    store = convert("womd", [packed], tmp_path / "out", limit=100, skip_bad=True)
+    assert store.scene_ids == ["scene3", "scene4"]
+    assert [skip["record"] for skip in store.manifests[0].skipped] == [2]
+    with pytest.raises(SceneError, match="b.tfrecord.gz"):
+        convert("womd", [packed], tmp_path / "strict", limit=100)
+
+
+def test_a_shard_that_could_not_be_read_back_is_refused_before_any_work(raw: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="shard_size must be at most 10000, got 70000"):
+        convert("womd", [raw], tmp_path / "out", shard_size=70_000)
 
 
 def test_nothing_but_bad_inputs_is_an_error(make_scenario, tmp_path: Path) -> None:

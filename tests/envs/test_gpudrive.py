@@ -74,6 +74,17 @@ def test_older_dialect_has_degrees_no_ids_and_the_sdc_last(older, save) -> None:
     ]
 
 
+def test_a_light_of_a_map_without_ids_belongs_to_the_lane_that_begins_where_it_stops_traffic(older, save) -> None:
+    older["roads"] = [
+        gpudrive_road(kind, xs) for kind, xs in [("road_edge", (1.0, 50.0)), ("lane", (90.0,)), ("lane", (2.0,))]
+    ]
+    scene = read_gpudrive(save(older))
+    assert scene.road.feature_id.tolist() == [-1, -2, -3], "no number that a light could name"
+    assert scene.lights.lane_id.tolist() == [-3]
+    older["roads"] = older["roads"][:1]
+    assert read_gpudrive(save(older)).lights.lane_id.tolist() == [117], "no lane to belong to"
+
+
 def test_a_heading_of_pi_in_float32_is_not_taken_for_degrees(newer, save) -> None:
     newer["objects"][1]["heading"] = [float(np.float32(math.pi))] * 91
     assert read_gpudrive(save(newer)).agents.heading[1, 0].item() == pytest.approx(math.pi)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import importlib.util
 import multiprocessing
+from collections import Counter
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -330,6 +331,28 @@ def test_too_many_scenes_for_one_simulation_is_an_error() -> None:
     unit = sumo.units(2, preset="town", windows=1, warmup=1.0, min_agents=500)[0]
     with pytest.raises(SceneError, match="holds only 0 of 2 scenes; lower"):
         sumo.simulate(unit)
+
+
+def test_a_simulation_that_fails_runs_once_for_all_of_its_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
+    ran = []
+
+    def fail(unit: sumo.SumoUnit) -> list[Scene]:
+        ran.append(unit)
+        raise SceneError("too few cars")
+
+    monkeypatch.setattr(sumo, "simulate", fail)
+    for record in sumo.SUMO.records(sumo.units(3)[0].text):
+        with pytest.raises(SceneError, match="too few cars"):
+            record.scene(Counter())
+    assert len(ran) == 1
+
+
+def test_other_settings_of_simulations_make_another_input(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = sumo.units(3)[0].text
+    before = sumo.SUMO.size(text)
+    other = sumo_settings() | {"presets": {}}
+    monkeypatch.setattr(sumo.options, "settings", lambda: other)
+    assert sumo.SUMO.size(text) != before
 
 
 def test_without_sumo_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -280,6 +280,15 @@ def test_scenes_of_equal_ids_and_other_content_are_other_scenes(tmp_path: Path, 
         ("evaluate", "evaluation.memory=2GB", "evaluation.memory must be a number, got '2GB'"),
         ("evaluate", "decoding.temperature=inf", "decoding.temperature must be a number, got inf"),
         ("evaluate", "json=FOLDER", "is a folder; name a file"),
+        ("evaluate", "json=null", "json=null: the result needs a file"),
+        (
+            "pretrain",
+            "scenes.tune=0.2",
+            "scenes.tune must be a number of training scenes, a path or a list of paths, got 0.2",
+        ),
+        ("pretrain", "scenes.eval=null", "scenes.eval must be a path or a list of paths, got None"),
+        ("pretrain", "+scenes.min_agents=4", "scenes has no option 'min_agents'; it takes source, train"),
+        ("align", "+method.data.margn=0.1", "method.data.margn says nothing to method.data.kind=pairs"),
     ],
 )
 def test_a_value_that_an_option_cannot_have_is_told_before_any_work(

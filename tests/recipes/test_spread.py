@@ -50,6 +50,12 @@ def test_rollouts_of_another_policy_are_refused(run: Callable, options: Callable
     assert "ranks rollouts of another policy than" in outcome.err
 
 
+def test_a_distance_is_not_fitted_on_evaluation_scenes(run: Callable, options: Callable, runs: Path) -> None:
+    given = (f"policy={runs / '0/policy.pt'}", f"preferences={runs / 'preferences'}", "split=eval")
+    outcome = run("spread", *options("spread", *given))
+    assert outcome.status == 2 and "not fitted on evaluation scenes" in outcome.err
+
+
 def test_agents_that_the_log_replays_are_not_measured() -> None:
     scene = straight_road(2, speed=10.0)
     log = log_trajectory(scene, 80)

@@ -20,21 +20,23 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
 from dpa.losses import ContrastivePreferenceLoss, token_network
-from dpa.policy import MotionLM, make_context
+from dpa.policy import ContextOptions, MotionLM, make_context
 from dpa.preferences import PreferenceStore, PreferenceWriter, nearest_farthest
 from dpa.realism.config import FOLDER
 from dpa.realism.score import score
 from dpa.realism.submission import validate
 from dpa.tokens import VerletTokenizer
+from dpa.training.batches import LogReader
 from dpa.training.checkpoint import load_policy
 from dpa.training.loggers import read_curve
 from dpa.training.optim import accumulate_gradients, clip_and_step
 from envs import keys
+from envs.augment import Augmentation
 from envs.scene import CURRENT_STEP
 from envs.sources.synthetic import straight_road
 from envs.store import SceneStore
 from recipes import evaluate as evaluation
-from recipes.alignment.candidates import Group, make_candidates
+from recipes.alignment.candidates import READ, Candidates, Group, make_candidates
 from recipes.alignment.draws import draw_rows, make_batch, parts_of
 from recipes.alignment.likelihoods import SIDED
 from recipes.alignment.losses import check_fit, make_loss
@@ -47,6 +49,7 @@ from recipes.common.scenes import open_splits
 from recipes.evaluate import SCENE_FIGURES, final_spread, standing_moved
 from recipes.experiment.jobs import align_job
 from recipes.experiment.pool import Job, Workers
+from recipes.pretrain import log_items
 
 METHODS = ("dpa_omf", "dpa_adef", "sft_best_oa", "sft_best_ade", "adversarial_afd")
 
@@ -79,6 +82,14 @@ def test_pretraining_writes_a_policy_and_its_curves(runs: Path) -> None:
     assert [step for step, _ in losses] == [1, 2, 3, 4, 5, 6]
     assert losses[-1][1] < losses[0][1]
     assert [step for step, _ in read_curve(runs / "reference", "tune/nll")] == [3, 6]
+
+
+def test_tuning_scenes_without_a_token_to_predict_are_refused() -> None:
+    scene = straight_road(2)
+    scene.agents.predict[:] = False
+    read = LogReader(VerletTokenizer(), ContextOptions(control="predict"), Augmentation(), noise=0.0, max_agents=8)
+    with pytest.raises(ValueError, match="none of the 1 tuning scenes has a token to predict: .*control=predict"):
+        log_items([scene], read)
 
 
 def test_the_weights_that_are_best_on_the_tuning_scenes_are_kept(runs: Path) -> None:
@@ -228,13 +239,14 @@ def compose_recipe(recipe: str, options: Callable, runs: Path) -> DictConfig:
         return compose(recipe, options(recipe, f"policy={runs}", f"preferences={runs}"))
 
 
-def pairs_of(runs: Path, options: Callable, expert: PreferenceStore | None = None, **data: object) -> list[Group]:
+def pairs_of(runs: Path, options: Callable, expert: PreferenceStore | None = None, **data: object) -> Candidates:
     """Candidates from the preferences, with ``data`` over those of DPA-OMF."""
     cfg = compose_recipe("align", options, runs)
     scenes = open_splits(cfg.scenes).train
     store = PreferenceStore(runs / "preferences")
     model, context, _ = open_policy(runs / "reference/policy.pt")
     section = OmegaConf.merge(OmegaConf.create(plain(cfg.method.data)), {"num": 2}, data)
+    section = OmegaConf.masked_copy(section, ["kind", *READ.get(section.kind, ())])
     return make_candidates(section, store, scenes, context, model.tokenizer, seed=0, expert=expert)
 
 
@@ -257,6 +269,14 @@ def test_the_options_of_a_method_decide_its_pairs(
     assert all(group.preferred.shape == group.unpreferred.shape for group in groups)
     again = pairs_of(runs, options, **data)
     assert all(torch.equal(a.preferred, b.preferred) for a, b in zip(groups, again, strict=True))
+
+
+def test_candidates_are_read_when_they_are_asked_for(runs: Path, options: Callable) -> None:
+    groups = pairs_of(runs, options)
+    with mock.patch.object(PreferenceStore, "read", side_effect=groups.store.read) as read:
+        first, again = groups[4], groups[4]
+    assert read.call_count == 2, "nothing of the rollouts is kept"
+    assert torch.equal(first.preferred, again.preferred) and first.context is again.context
 
 
 def test_a_margin_leaves_the_clear_pairs(runs: Path, options: Callable) -> None:
@@ -1009,14 +1029,34 @@ def test_jobs_under_way_beside_one_that_fails_are_not_lost_and_no_other_is_begun
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bad, slow = Job(json.loads, ("{",), "bad"), Job(time.sleep, (2,), "slow")
-    later = [Job(os.mkdir, (str(tmp_path / str(number)),), str(number)) for number in range(20)]
+    (made := tmp_path / "made").mkdir()
+    later = [Job(os.mkdir, (str(made / str(number)),), str(number)) for number in range(20)]
     ended = []
     with Workers(2, threads=1) as workers:
         list(workers.run([Job(time.sleep, (0,), "start")] * 4, "warm"))
         with pytest.raises(ValueError, match="Expecting property name"):
-            ended += (name for name, *_ in workers.run([bad, slow, *later], "jobs"))
-    assert "slow" in ended and len(list(tmp_path.iterdir())) < len(later) / 2
+            ended += (name for name, *_ in workers.run([slow, bad, *later], "jobs"))
+    assert ended == ["slow"] and not list(made.iterdir())
     assert "bad: Expecting property name" in capsys.readouterr().err, "told at once"
+
+
+def test_workers_that_are_told_to_stop_begin_no_job(tmp_path: Path) -> None:
+    slow = Job(time.sleep, (1,), "slow")
+    (made := tmp_path / "made").mkdir()
+    later = [Job(os.mkdir, (str(made / str(number)),), str(number)) for number in range(20)]
+    with Workers(2, threads=1) as workers:
+        next(workers.run([slow, slow, *later], "jobs"))
+    assert len(list(made.iterdir())) <= 1
+
+
+def test_workers_share_the_gpus_that_the_command_may_use(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
+    seen = []
+    for spread in (True, False):
+        with Workers(2, threads=1, spread=spread) as workers:
+            jobs = [Job(os.getenv, ("CUDA_VISIBLE_DEVICES",), str(number)) for number in range(8)]
+            seen.append({result for _, _, result in workers.run(jobs, "jobs")})
+    assert seen[0] and seen[0] <= {"3", "5"} and seen[1] == {"3,5"}
 
 
 def test_a_killed_worker_is_told_with_what_to_do() -> None:

@@ -15,7 +15,7 @@ from dpa.report.experiment import Experiment
 from dpa.report.markup import Html, Section, element, folded, hint, joined, sources, stacked, table
 from dpa.report.paired import paired_figure, quiet_change
 from dpa.report.study import Evaluations
-from dpa.report.table import MINUS, REFERENCE, number
+from dpa.report.table import MINUS, REFERENCE, mean_over_seeds, number
 
 FIGURES = {
     "pair_accuracy": "pair accuracy ↑", "reward_accuracy": "reward accuracy ↑",
@@ -32,7 +32,7 @@ SIDES = {
 HEALTH = {
     "train/logit_std": ("Spread of the preference logits", "standard deviation of the logits"),
     "train/saturated": ("Share of saturated pairs", "share of pairs"),
-    "tune/kl": ("KL to the reference", "KL per token [nats]"),
+    "tune/kl": ("KL along the reference's ranked rollouts", "KL per token [nats]"),
     "tune/entropy": ("Entropy of the tokens", "entropy per token [nats]"),
     "tune/pair_accuracy": ("Pair accuracy", "share of pairs"),
     "tune/reward_accuracy": ("Reward accuracy", "share of pairs"),
@@ -65,7 +65,12 @@ def likelihood_table(experiment: Experiment, evaluations: Evaluations) -> Html:
         for key in shown:
             digits, base = DIGITS.get(key, 3), by_method.get(REFERENCE, [])
             found = None if method == REFERENCE else paired_figure(of_method, base, key, evaluations)
-            cells.append(joined([number(_mean(of_method, key), digits), quiet_change(found, digits)], ""))
+            cells.append(
+                joined(
+                    [number(mean_over_seeds([row.get(key) for row in of_method]), digits), quiet_change(found, digits)],
+                    "",
+                )
+            )
         rows.append([experiment.labels[method], *cells, sources([row["file"] for row in of_method])])
     parts = [
         *([_table_3(experiment, by_method, evaluations)] if set(TABLE_3) <= set(by_method) else []),
@@ -75,7 +80,8 @@ def likelihood_table(experiment: Experiment, evaluations: Evaluations) -> Html:
             f"On the reference's ranked rollouts of the {experiment.reported}, means over seeds; in small type the "
             "difference from the reference with its 95 % interval. Pair accuracy: how often the nearer rollout of a "
             "pair is the likelier one; reward accuracy: how often it gained more "
-            "likelihood over the reference (chance: 0.5). NLL: negative log-likelihood per token [nats]."
+            "likelihood over the reference (chance: 0.5). NLL: negative log-likelihood per token [nats]. KL: along the "
+            "method's own rollouts, per token [nats]."
         ),
     ]
     return joined(parts)
@@ -94,7 +100,7 @@ def _table_3(
         cells = []
         for key in OF_TABLE_3:
             paper = [element("small", f"paper {number(published[key], 3)}")] if key in published else []
-            cells.append(joined([number(_mean(runs(method, key), key), 3), *paper], ""))
+            cells.append(joined([number(mean_over_seeds([row.get(key) for row in runs(method, key)]), 3), *paper], ""))
         rows.append([experiment.labels[method], *cells])
     mine = TABLE_3[0]
     for other in (TABLE_3[1], REFERENCE):
@@ -198,8 +204,3 @@ def blocks(curve: Curve, points: int) -> tuple[list[float], list[float]]:
     parts = [known[first : first + size] for first in range(0, len(known), size)]
     means = [tuple(sum(column) / len(part) for column in zip(*part, strict=True)) for part in parts]
     return [step for step, _ in means], [value for _, value in means]
-
-
-def _mean(rows: Sequence[Mapping[str, Any]], key: str) -> float | None:
-    values = [row.get(key) for row in rows]
-    return None if not values or None in values else sum(values) / len(values)

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from dpa.report.markup import Section, element
+from dpa.report.markup import Section, element, hint, joined
 from dpa.report.study import STUDIES, Study
 
 OF_ONE = ("experiment", "method", "rankings", "pictures")
@@ -47,7 +47,8 @@ def missing_section(study: Study, experiments: Iterable[str]) -> Section | None:
     if not lacking:
         return None
     rows = [element("li", name, ": ", element("code", command)) for name, command in lacking.items()]
-    return Section("missing", "Not here yet", element("ul", *rows))
+    note = hint(f"{', '.join(STUDIES)} rank by options of their own (--help), not by those of the experiments.")
+    return Section("missing", "Not here yet", joined([element("ul", *rows), note]))
 
 
 def _again(command: str, folder: Path) -> str:

@@ -31,6 +31,11 @@ from dpa.report.sections.scaling import scaling_charts
 from dpa.report.study import FIRST, Evaluations
 from dpa.report.table import COLUMNS, MISSING, REFERENCE, duration, number, signed
 
+DPO = {
+    "kind": "contrastive", "link": "logistic", "reference": True, "conservative": 1.0, "score_reduction": "sum",
+    "credit": "scene", "margin": 0.0, "label_smoothing": 0.0, "cloning": 0.0,
+}  # fmt: skip
+"""Options of a loss that is DPO's."""
 MAIN = ("kinematic", "interactive", "map_based", "realism", "min_ade")
 """Figures of the first table, in the paper's order."""
 
@@ -196,7 +201,7 @@ def _remarks(experiment: Experiment, comparison: Comparison) -> list[str]:
 def _which_loss(experiment: Experiment) -> str | None:
     """What stands behind the name of the paper's method in the main experiment, as it was run."""
     loss = experiment.config.get("methods", {}).get("dpa_omf", {}).get("loss", {})
-    if experiment.name != FIRST or not loss.get("reference"):
+    if experiment.name != FIRST or any(loss.get(name) != value for name, value in DPO.items()):
         return None
     return (
         f"{experiment.labels['dpa_omf']} here is eq. 4 with the reference term, which is DPO. The plain form that the "

@@ -1,4 +1,4 @@
-"""Safety of an experiment's methods, by who else sees it: nobody, the preference distance, the metric, or both."""
+"""Safety of an experiment's methods, by who else sees it: nobody, the paper's distance, the metric, or both."""
 
 from __future__ import annotations
 
@@ -36,8 +36,9 @@ def safety_tables(experiment: Experiment, comparison: Comparison, evaluations: E
     if not shown:
         return Html("")
     note = (
-        f"Means over seeds and {experiment.reported}. Below each its difference from the reference, with a 95 % "
-        "interval over the scenes where all have a value; bold where the interval does not contain 0."
+        f"Means over seeds and those of the {experiment.reported} where a rate is known. Below each its difference "
+        "from the reference, with a 95 % interval over the scenes where all have a value; bold where the interval does "
+        "not contain 0."
     )
     return joined([*(joined([element("h3", title), found]) for title, found in shown), hint(note)])
 
@@ -46,16 +47,16 @@ def groups_of(experiment: Experiment) -> dict[str, Mapping[str, str]]:
     """Measures of safety and what they are called, by who sees them.
 
     Args:
-        experiment: whose metric may see more than that of other years.
+        experiment: whose metric may see more than that of other years; a YAML of one's own is taken for one of 2024.
     """
     unseen, weighed = dict(UNSEEN), {}
     if experiment.metric.startswith(RED_LIGHTS):
         weighed = {"red_light": unseen.pop("red_light")}
     return {
-        "Safety that neither the preference distance nor the metric sees": unseen,
+        "Safety that neither the paper's preference distance nor the metric sees": unseen,
         "Relatives of the distance's clearance and effort, measured otherwise": RELATED,
-        f"Safety that the metric of {experiment.metric} sees, and the preference distance does not": weighed,
-        "Safety that both the preference distance and the metric see": SEEN,
+        f"Safety that the metric of {experiment.metric} sees, and the paper's preference distance does not": weighed,
+        "Safety that both the paper's preference distance and the metric see": SEEN,
     }
 
 

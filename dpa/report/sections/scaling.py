@@ -7,7 +7,7 @@ from typing import Any
 
 from dpa.report.charts import Chart, Line, curves, lines
 from dpa.report.experiment import Comparison, Experiment
-from dpa.report.table import REFERENCE, difference, number
+from dpa.report.table import REFERENCE, difference, mean_over_seeds, number
 
 COLOURS, DASHES = ("#2a78b5", "#c79a1b"), ("solid", "dot")
 """Of what is scaled, for the comparisons of an experiment."""
@@ -63,7 +63,11 @@ def _against_kl(experiment: Experiment, colours: Mapping[str, str]) -> list[Char
     bases = list(dict.fromkeys(method.partition("@")[0] for method in experiment.methods if "@" in method))
     content = []
     for (kind, comparison), colour, dash in zip(experiment.comparisons().items(), COLOURS, DASHES, strict=False):
-        scaled = [entry for entry in _scaled(experiment, comparison) if kl[entry["method"]] is not None]
+        # KL was measured of the checkpoint that stands for a method at its own best decoding.
+        known = {
+            m for m in experiment.methods if comparison.steps[m] == experiment.own_best.steps[m] and kl[m] is not None
+        }
+        scaled = [entry for entry in _scaled(experiment, comparison) if entry["method"] in known]
         if experiment.axis is not None and scaled:
             name, values = f"{experiment.axis.name}, {kind}", experiment.axis.values
             line = _drift(experiment, scaled, kl, name, colour, dash)
@@ -131,8 +135,7 @@ def _snapshots(
 
 
 def _mean_kl(experiment: Experiment, method: str) -> float | None:
-    values = [row.get("kl") for row in experiment.likelihood if row["method"] == method]
-    return None if not values or None in values else sum(values) / len(values)
+    return mean_over_seeds([row.get("kl") for row in experiment.likelihood if row["method"] == method])
 
 
 def _told(entry: Mapping[str, Any]) -> Sequence[str]:

@@ -15,14 +15,14 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
 
 from envs.scene import STEP_SECONDS, Lacks, Scene, SceneError
 from envs.sources.files import file_size
-from envs.sources.source import Record, Source
+from envs.sources.source import Notes, Record, Source
 from envs.sources.sumo.classes import make_body
 from envs.sources.sumo.cut import cut_scene, sdc_candidates
 from envs.sources.sumo.demand import draw_types, traffic_rules, write_demand
@@ -39,6 +39,7 @@ from envs.sources.sumo.options import (
     parse,
     presets,
     settings,
+    settings_digest,
 )
 from envs.sources.sumo.own import own_network, read_routes, stem
 from envs.sources.sumo.tracks import Tracks, make_tracks
@@ -291,15 +292,27 @@ def _read_unit(text: str) -> SumoUnit:
 def _records(text: str) -> Iterator[Record]:
     """The scenes of one simulation, which runs once, when the first of them is made."""
     unit = _read_unit(text)
-    scenes = cache(lambda: simulate(unit))
+
+    @cache
+    def outcome() -> list[Scene] | SceneError:
+        try:
+            return simulate(unit)
+        except SceneError as error:  # a cache keeps no errors, and each of its scenes would run the simulation again
+            return error
+
+    def make(index: int, notes: Notes) -> Scene:
+        if isinstance(made := outcome(), SceneError):
+            raise made
+        return made[index]
+
     for index in range(unit.num_scenes):
-        yield Record(text, index, lambda notes, index=index: scenes()[index])
+        yield Record(text, index, partial(make, index))
 
 
 def _size(text: str) -> int:
-    """Bytes of the user's own files, by which a change of them is known."""
+    """A number that changes with the user's own files, by their bytes, and with the settings of all simulations."""
     unit = _read_unit(text)
-    return sum(file_size(path) for path in (unit.net, unit.routes) if path)
+    return sum(file_size(path) for path in (unit.net, unit.routes) if path) + settings_digest()
 
 
 SUMO = Source(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from functools import cache
@@ -62,6 +64,11 @@ NAMES = [field.name for field in fields(SumoOptions)]
 def settings() -> dict[str, dict]:
     """Everything in ``sumo.yaml``."""
     return yaml.safe_load(files("envs.sources.sumo").joinpath("sumo.yaml").read_text(encoding="utf-8"))
+
+
+def settings_digest() -> int:
+    """A number of 32 bits that changes with ``sumo.yaml``."""
+    return zlib.crc32(json.dumps(settings(), sort_keys=True).encode())
 
 
 def presets() -> list[str]:

@@ -49,6 +49,15 @@ def teacher_forced(model: MotionLM, scenes: list[Scene], scene: Tensor, tokens: 
     return log_probs.gather(-1, tokens[:, None, ..., None])[:, 0, ..., 0]
 
 
+def test_the_contexts_used_last_are_kept() -> None:
+    contexts = Contexts([straight_road(count) for count in (1, 2, 3)], most=2)
+    first, _, again = contexts[0], contexts[1], contexts[0]
+    assert again is first
+    contexts[2]
+    assert contexts[0] is first, "used after the second one, which had to go"
+    assert len(contexts._made) == 2 and len(contexts) == 3
+
+
 def assert_as_teacher_forced(model: MotionLM, scenes: list[Scene], rollout: TensorDictBase) -> None:
     """One episode ``[B, T]``: the written log-probabilities are those of the model in one pass."""
     tokens = rollout[keys.TOKEN].transpose(1, 2)

@@ -43,6 +43,21 @@ def test_pieces_lie_on_their_polylines_and_have_the_length_asked_for() -> None:
     assert sum(context.map_kind == MapKind.LINE_BROKEN_YELLOW) == 20, "500 m in pieces of 25 m"
 
 
+def test_map_features_without_points_have_no_pieces_wherever_they_stand() -> None:
+    lines = [(MapKind.DRIVEWAY, torch.zeros(0, 2)), (MapKind.EDGE_BOUNDARY, torch.tensor([[0.0, 5.0], [10.0, 5.0]]))]
+    poses = torch.zeros(1, 91, 3)
+    alone = make_context(build_scene(poses, lines[1:]))
+    for each in (lines, lines[::-1]):
+        context = make_context(build_scene(poses, each))
+        assert torch.equal(context.map_points, alone.map_points) and torch.equal(context.map_kind, alone.map_kind)
+    assert len(make_context(build_scene(poses, lines[:1])).map_kind) == 0
+
+
+def test_a_decision_longer_than_the_history_is_refused() -> None:
+    with pytest.raises(ValueError, match="decision_steps must be at most the 10 steps of 0.1 s of the history, got 16"):
+        ContextOptions(decision_steps=16, horizon=5)
+
+
 def test_pieces_point_along_their_lane() -> None:
     context = make_context(straight_road())
     y, heading = context.map_pose[:, 1], context.map_pose[:, 2]

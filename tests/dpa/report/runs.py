@@ -14,6 +14,7 @@ from omegaconf import OmegaConf
 from dpa.preferences.examples import example_groups, example_provenance
 from dpa.preferences.writer import PreferenceWriter
 from dpa.report.player import PlayerScene, pack_players
+from dpa.report.sections.results import DPO
 from dpa.report.statistics import paired_bootstrap
 from envs.card import Card
 from envs.sources.synthetic import red_light, straight_road
@@ -104,7 +105,7 @@ def write_experiment(
         "curves": {m: {str(seed): curves(folder, m, seed) for seed in SEEDS} for m in others if "@" not in m},
         "budget": {m: {"steps": 60, "rollouts": 960, "start": "reference"} for m in others if "@" not in m},
         "stages": {"pretrain": 5400.0, "align": 125.0}, "worker_seconds": 5525.0,
-        "config": {"mark": "<!--{title}-->", "methods": {"dpa_omf": {"loss": {"reference": True}}}},
+        "config": {"mark": "<!--{title}-->", "methods": {"dpa_omf": {"loss": DPO}}},
         "revision": "0123abc", "versions": {"torch": "2.13.0"},
         "machine": "Linux x86_64, 2 CPU cores", "date": "2026-11-21",
         "command": f"python -m recipes.compare experiment={name} 'name=<b>'",

@@ -113,7 +113,7 @@ def test_the_number_of_comparisons_is_said(found: Experiment) -> None:
 def test_scenes_without_realism_are_said(found: Experiment) -> None:
     assert not any("no realism" in note for note in reservations(found))
     notes = reservations(dataclasses.replace(found, left_out=2))
-    assert "Differences are over 10 of 12 evaluation scenes: on the others some run has no realism." in notes
+    assert "Realism and its differences are over 10 of 12 evaluation scenes: on the others some run has none." in notes
 
 
 def test_methods_are_sorted_by_what_can_be_told_of_them_against_the_headlines(found: Experiment) -> None:

@@ -22,7 +22,8 @@ def test_every_scene_shows_its_log_and_the_most_likely_rollout_of_each_policy(dr
     shown = [axes.get_title().split(", distance")[0] for axes in drawn[0].axes if axes.axison]
     road, light = (player.scene.scene_id for player in players)
     assert shown == [
-        f"log of {road}", "reference\n-1.00 nats", "DPA-OMF\n-0.50 nats", f"log of {light}", "reference\n-1.25 nats",
+        f"log of {road}", "reference\n-1.00 nats per token", "DPA-OMF\n-0.50 nats per token",
+        f"log of {light}", "reference\n-1.25 nats per token",
     ]  # fmt: skip
     assert (tmp_path / "likely.png").stat().st_size > 10_000
 

@@ -143,7 +143,7 @@ def test_the_order_sorts_the_list_and_keeps_the_rollout(player: Player) -> None:
     assert numbers(r"distance ([\d.]+)") == sorted(numbers(r"distance ([\d.]+)"))
     shown = player.text("roll-name")
     player.choose("sort", "likelihood")
-    assert numbers(r"(−[\d.]+) nats") == [-1.0, -1.5, -2.0, -3.0]
+    assert numbers(r"(−[\d.]+) nats per token") == [-1.0, -1.5, -2.0, -3.0]
     assert player.options("rollout")[0].startswith("1st of 4") and player.chosen("rollout").endswith("most likely")
     assert player.text("roll-name") != shown and "1st of 4" in player.text("roll-name")
 

@@ -14,6 +14,7 @@ import pytest
 
 from dpa.report.charts import _rounded
 from dpa.report.page import write_study
+from dpa.report.sections.results import DPO
 from dpa.report.statistics import paired_bootstrap
 from dpa.report.study import read_study
 from dpa.report.table import difference, number, signed
@@ -169,7 +170,7 @@ def test_safety_that_the_ranking_sees_stands_apart(page: Page) -> None:
     assert [clean(cell) for cell in safety(page, "collision ↓")] == ["method", "collision ↓", "off-road ↓"]
     assert [clean(cell) for cell in safety(page, "wrong way ↓")] == ["method", "wrong way ↓", "red light ↓"]
     assert [clean(cell) for cell in safety(page, "close pass ↓")] == ["method", "close pass ↓", "harsh jerk ↓"]
-    assert "Safety that neither the preference distance nor the metric sees" in page.text
+    assert "Safety that neither the paper's preference distance nor the metric sees" in page.text
 
 
 def test_red_lights_stand_apart_where_the_metric_weighs_them(copied: Path, tmp_path: Path) -> None:
@@ -455,8 +456,9 @@ def test_methods_whose_loss_saturated_are_named_with_their_seeds(page: Page, cop
 def test_what_the_papers_method_is_here_is_said_below_its_table(page: Page, copied: Path, tmp_path: Path) -> None:
     told = "DPA-OMF here is eq. 4 with the reference term, which is DPO."
     assert page.text.count(told) == 2  # of either decoding
-    change(copied, "methods", config={"methods": {"dpa_omf": {"loss": {"reference": False}}}})
-    assert told not in Page(report(copied, tmp_path / "out").read_text(encoding="utf-8")).text
+    for other in ({"reference": False}, {"link": "squared"}, {"conservative": 0.5}):
+        change(copied, "methods", config={"methods": {"dpa_omf": {"loss": DPO | other}}})
+        assert told not in Page(report(copied, tmp_path / "out").read_text(encoding="utf-8")).text
 
 
 def test_an_experiment_on_the_tuning_scenes_says_so_everywhere(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from dpa.ranking.transform import RankRollouts
 from dpa.rollout import RolloutCollector, Workers, bytes_per_row, make_collector
 from dpa.rollout.collector import agents_of
 from dpa.rollout.plan import GIB
+from dpa.rollout.ray_crew import RayCrew
 from dpa.tokens import TokenAction
 from envs import keys
 from envs.scene import Scene
@@ -306,3 +307,36 @@ def test_a_ray_cluster_gives_the_same_rollouts_and_survives_a_killed_worker(
         assert "CPUs free" in wanting.call_args[0][0] and "needs 4096 CPUs" in wanting.call_args[0][0]
     finally:
         ray.shutdown()
+
+
+class _Errors:
+    """What :mod:`ray.exceptions` has, with what the crew asks of it."""
+
+    class RayTaskError(Exception):
+        cause = ValueError("of the task")
+
+    class OutOfMemoryError(Exception):
+        pass
+
+    class RayActorError(Exception):
+        def __init__(self, actor_init_failed: bool) -> None:
+            super().__init__("The actor died.\nValueError: no such GPU")
+            self.actor_init_failed = actor_init_failed
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (_Errors.RayTaskError(), "of the task"),
+        (_Errors.RayActorError(actor_init_failed=True), "a Ray worker could not start: ValueError: no such GPU"),
+        (_Errors.RayActorError(actor_init_failed=False), None),
+        (_Errors.OutOfMemoryError(), None),
+    ],
+)
+def test_a_ray_worker_that_is_lost_is_replaced_and_one_that_cannot_start_says_why(error: Exception, told: str) -> None:
+    crew = object.__new__(RayCrew)
+    crew._ray = mock.Mock(exceptions=_Errors, wait=lambda running, **_: (running, []), get=mock.Mock(side_effect=error))
+    crew._running, crew._hands, crew._start = {"task": 0}, ["lost"], lambda: "new"
+    worker, outcome = crew.wait()
+    assert (worker, outcome.batch, crew._hands) == (0, None, ["lost" if told else "new"])
+    assert str(outcome.error) == str(told)
