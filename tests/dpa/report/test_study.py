@@ -176,7 +176,7 @@ def test_safety_that_the_ranking_sees_stands_apart(page: Page) -> None:
 def test_red_lights_stand_apart_where_the_metric_weighs_them(copied: Path, tmp_path: Path) -> None:
     change(copied, "methods", metric="2025")
     page = Page(report(copied, tmp_path / "out").read_text(encoding="utf-8"))
-    assert "Safety that the metric of 2025 sees, and the preference distance does not" in page.text
+    assert "Safety that the metric of 2025 sees, and the paper's preference distance does not" in page.text
     assert [clean(cell) for cell in safety(page, "red light ↓")] == ["method", "red light ↓"]
     assert "red light ↓" not in map(clean, safety(page, "wrong way ↓"))
 
