@@ -61,6 +61,7 @@ def test_scenes_are_measured_raw_and_stored(make_scenario, tmp_path: Path, capsy
     assert not list(work.iterdir())
 
 
+@pytest.mark.slow
 def test_rollouts_are_measured_and_planned_with(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, plan = tmp_path / "rollout.json", tmp_path / "plan.json"
     small = ["--size", "nano", "--agents", "2", "--rollouts", "2", "--threads", "1", "--repeats", "1"]

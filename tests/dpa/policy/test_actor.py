@@ -245,6 +245,7 @@ def test_bfloat16_changes_the_distribution_by_little(model: MotionLM, scenes: li
 @pytest.mark.filterwarnings("ignore:.torch.jit:DeprecationWarning")  # raised by torch's own compiler
 @pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs a C++ compiler")
 @torch.no_grad()
+@pytest.mark.slow
 def test_a_compiled_decoder_gives_the_same_log_probs_and_tokens(model: MotionLM, scenes: list[Scene]) -> None:
     ways = drive(model, scenes), drive(model, scenes, compile=True)
     expected, found = (env.rollout(16, actor) for env, actor in ways)
