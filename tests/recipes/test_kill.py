@@ -98,6 +98,7 @@ def collect_here(arguments: list[str]) -> None:
     collect_main()
 
 
+@pytest.mark.timeout(1800)  # a hundred processes, on machines that share their cores
 def test_a_collection_killed_at_fifty_random_moments(run: Callable, options: Callable, tmp_path: Path) -> None:
     """Started again after each kill; a store that is full before there were enough kills is begun anew."""
 
