@@ -52,7 +52,8 @@ def player(open_player: Callable[..., Player]) -> Player:
 # --- what is there --------------------------------------------------------------------------------------------------
 def test_it_opens_with_the_most_likely_rollout_of_the_first_method(player: Player) -> None:
     assert player.options("method") == ["reference", "DPA-OMF"]
-    assert re.fullmatch(r"\d\w\w of 4 · distance [\d.]+ · −1\.00 nats per token · most likely", player.chosen("rollout"))
+    shown = r"\d\w\w of 4 · distance [\d.]+ · −1\.00 nats per token · most likely"
+    assert re.fullmatch(shown, player.chosen("rollout"))
     assert "reference" in player.text("roll-name") and "−1.00 nats" in player.text("roll-name")
     assert player.text("clock") == "+0.0 s"
 
