@@ -17,7 +17,6 @@ from omegaconf import DictConfig
 
 from dpa.losses import SaturationWatch
 from dpa.report.curves import read_curves
-from dpa.report.findings import SATURATED
 from dpa.training.batches import ShuffledOrder, with_tokens
 from dpa.training.distributed import ALONE, Ranks, join_ranks
 from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
@@ -35,6 +34,9 @@ from recipes.alignment.watch import Watch
 from recipes.common.cli import CONFIG, check_steps, finished, finite, ranked_recipe
 from recipes.common.models import check_written, write_policy
 from recipes.common.scenes import open_splits
+
+SATURATED = "saturated"
+"""Entry of ``result.json`` that only a run with a saturated loss has: the warning."""
 
 
 def align(

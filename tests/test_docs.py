@@ -16,9 +16,10 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from dpa.ranking import AGGREGATES, FEATURES, SOLVERS
+from dpa.report.likelihoods import who_learns
 from dpa.report.statistics import paired_bootstrap
-from dpa.report.study import Study, read_study
-from dpa.report.text import comparison_table
+from dpa.report.study import FIRST, Evaluations, Study, read_study
+from dpa.report.text import comparison_table, learnt_table, likelihood_table, sharpness_table
 from envs import keys
 from envs.convert.__main__ import make_parser as convert_parser
 from envs.sources import SOURCES
@@ -275,6 +276,14 @@ def test_the_tables_of_the_results_are_those_of_the_studies_beside_them(study: S
         for comparison in [experiment.own_best] if one else [experiment.own_best, experiment.at_common]:
             rows = comparison_table(experiment, comparison).splitlines()
             assert not [row for row in rows if row not in told]
+        evaluations = Evaluations(study.folder)
+        learnt = who_learns(experiment, evaluations) if experiment.name == FIRST else None
+        tables = [
+            sharpness_table(experiment, evaluations),
+            likelihood_table(experiment, evaluations),
+            None if learnt is None else learnt_table(learnt),
+        ]
+        assert not [row for table in tables if table is not None for row in table.splitlines() if row not in told]
 
 
 def options_told(experiment: str) -> list[str]:

@@ -7,6 +7,8 @@ from collections.abc import Mapping, MutableMapping
 from statistics import fmean, pvariance
 from typing import Any
 
+WATCHED = ("saturated", "weight_mean", "weight_std", "logit_mean", "logit_std")
+"""What is looked at in a step."""
 WINDOW = 10
 """Steps that the share of saturated pairs is averaged over."""
 TOO_MANY = 0.5
@@ -59,15 +61,15 @@ class SaturationWatch:
 
         Args:
             step: counted from 0.
-            figures: what the loss returned for the step; one without ``saturated`` (imitation), or whose weights do
-                not follow the sigmoid of a logit (squared and hinge link), is never told off.
+            figures: what the loss returned for the step; one without ``saturated`` (imitation), or whose weights grow
+                with the logit (squared link), is never told off.
 
         Returns:
             The warning, or None.
         """
-        if self.found or "saturated" not in figures or self.options.get("link", "logistic") != "logistic":
+        if self.found or "saturated" not in figures or self.options.get("link") == "squared":
             return None
-        seen = [float(figures[name]) for name in ("saturated", "weight_mean", "weight_std")]
+        seen = [float(figures[name]) for name in WATCHED[:3]]
         window = self._state["window"] = [*self._state["window"], [step, *seen]][-WINDOW:]
         steps, shares, weights, spreads = zip(*window, strict=True)
         share = fmean(shares)
@@ -90,14 +92,17 @@ class SaturationWatch:
 
     def _advice(self, figures: Mapping[str, Any]) -> str:
         ways = []
-        if self.options.get("reference") is False:
-            ways.append(f"say {self.section}.reference=true")
         if self.options.get("score_reduction") != "token_mean":
             ways.append(f"say {self.section}.score_reduction=token_mean")
         if "alpha" in self.options:
             ways.append(f"lower {self.section}.alpha={self.options['alpha']} to {self._smaller_alpha(figures):g}")
-        text = ", or ".join(ways) or "make its scores smaller"
-        return text[0].upper() + text[1:]
+        smaller = ", or ".join(ways) or "make its scores smaller"
+        if self.options.get("reference") is False:
+            return (
+                f"Say {self.section}.reference=true. Without it, to {smaller} saturates fewer, but those whose "
+                "preferred rollout was improbable still weigh most"
+            )
+        return smaller[0].upper() + smaller[1:]
 
     def _smaller_alpha(self, figures: Mapping[str, Any]) -> float:
         """With which logits would be of size 1 (scores are proportional to alpha), to one digit."""

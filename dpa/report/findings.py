@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from dpa.losses.saturation import WATCHED, SaturationWatch
+from dpa.report.curves import read_curves
 from dpa.report.experiment import Decoding, Experiment, decoding_of, in_words, read_json
 from dpa.report.statistics import SCENES
 from dpa.report.table import REFERENCE, signed
 
-SATURATED = "saturated"
-"""Entry of a run's ``result.json`` that only a run with a saturated loss has: the warning."""
 FEW_SEEDS = 5
 """With fewer training runs a bootstrap interval is too narrow; see :func:`dpa.report.statistics.paired_bootstrap`."""
 
@@ -129,22 +129,34 @@ def budgets(experiment: Experiment) -> str | None:
 def saturated(experiment: Experiment, folder: Path) -> str | None:
     """Which methods trained with a loss that no longer weighed preferences; None where no run says so.
 
+    The curves are watched anew, so that runs of code that did not warn yet are told of as well.
+
     Args:
         experiment: whose runs are asked; a run without a ``result.json`` in the folder says nothing.
         folder: of the study.
     """
     told = []
     for method, runs in experiment.curves.items():
-        results = [folder / run / "result.json" for run in runs.values()]
-        warned = sum(SATURATED in read_json(result) for result in results if result.is_file())
+        warned = sum(_has_saturated(folder / run) for run in runs.values() if (folder / run / "result.json").is_file())
         if warned:
             told.append(f"{experiment.labels[method]} ({warned} of {len(runs)} seeds)")
     if not told:
         return None
     return (
         f"Saturated: {', '.join(told)}. The weights of their pairs say little about how clear a preference is; the "
-        "warning of each run says why, and what to change."
+        "warning that `recipes.align` gives says why, and what to change."
     )
+
+
+def _has_saturated(run: Path) -> bool:
+    """Whether the loss of a finished run saturated, by its options and its curves."""
+    watch, curves = SaturationWatch(read_json(run / "result.json")["options"]["loss"]), read_curves(run)
+    if any(f"train/{name}" not in curves for name in WATCHED):  # it imitates
+        return False
+    seen = [curves[f"train/{name}"] for name in WATCHED]
+    for done, *figures in zip(seen[0]["step"], *(curve["value"] for curve in seen), strict=True):
+        watch(int(done) - 1, dict(zip(WATCHED, figures, strict=True)))
+    return watch.found is not None
 
 
 def ordering(experiment: Experiment) -> str:

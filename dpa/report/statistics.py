@@ -102,6 +102,38 @@ def summary(values: ArrayLike, num_resamples: int = 10_000, *, seed: int = 0) ->
     return _bootstrap(_checked(values, "values"), num_resamples, seed)
 
 
+def resampled_means(values: ArrayLike, num_resamples: int = 10_000, *, seed: int = 0) -> NDArray[np.float64]:
+    """Means of several measures in the same resamples of :func:`paired_bootstrap`, for what is made of more than one.
+
+    Args:
+        values: ``[measures, seeds, scenes]``, finite.
+        num_resamples: bootstrap draws.
+        seed: of the draws.
+
+    Returns:
+        ``[measures, num_resamples]``.
+
+    Raises:
+        ValueError: no draw.
+
+    Examples:
+        >>> resampled_means([[[1.0, 1.0]], [[2.0, 2.0]]], num_resamples=3)
+        array([[1., 1., 1.],
+               [2., 2., 2.]])
+    """
+    if num_resamples < 1:
+        raise ValueError(f"num_resamples must be at least 1, got {num_resamples}.")
+    values = np.asarray(values, dtype=np.float64)
+    _, num_seeds, num_scenes = values.shape
+    drawn = _kept_draws if num_resamples * num_scenes <= _COUNTS_KEPT else _draws
+    # Drawing rows and columns is the same as weighting them, so that means are products of counts.
+    means = [
+        [np.einsum("rk,kn,rn->r", seeds, measure, scenes, optimize=True) / measure.size for measure in values]
+        for seeds, scenes in drawn(num_seeds, num_scenes, num_resamples, seed)
+    ]
+    return np.concatenate(means, axis=1)
+
+
 def compare_methods(
     per_scene: Mapping[str, Mapping[str, Sequence[float]]],
     reference: str,
@@ -179,18 +211,14 @@ def _checked(values: ArrayLike, name: str) -> NDArray[np.float64]:
 
 
 def _bootstrap(values: NDArray[np.float64], num_resamples: int, seed: int) -> Interval:
-    """Resampled means as products of counts: drawing rows and columns is the same as weighting them."""
-    if num_resamples < 1:
-        raise ValueError(f"num_resamples must be at least 1, got {num_resamples}.")
-    num_seeds, num_scenes = values.shape
-    drawn = _kept_draws if num_resamples * num_scenes <= _COUNTS_KEPT else _draws
-    means = [
-        np.einsum("rk,kn,rn->r", seeds, values, scenes, optimize=True) / values.size
-        for seeds, scenes in drawn(num_seeds, num_scenes, num_resamples, seed)
-    ]
-    low, high = np.quantile(np.concatenate(means), [0.025, 0.975])
+    return interval_of(float(values.mean()), resampled_means(values[None], num_resamples, seed=seed)[0], *values.shape)
+
+
+def interval_of(mean: float, resampled: NDArray[np.float64], num_seeds: int, num_scenes: int) -> Interval:
+    """The percentile interval of a figure from its values in every resample."""
+    low, high = np.quantile(resampled, [0.025, 0.975])
     over = SCENES if num_seeds == 1 else SEEDS_AND_SCENES
-    return Interval(float(values.mean()), float(low), float(high), over, num_seeds, num_scenes)
+    return Interval(mean, float(low), float(high), over, num_seeds, num_scenes)
 
 
 def _draws(num_seeds: int, num_scenes: int, num_resamples: int, seed: int) -> Iterator[tuple[NDArray, NDArray]]:

@@ -150,7 +150,7 @@ def signed(value: float, digits: int = 3) -> str:
     return f"{0:.{digits}f}" if abs(value) < ROUNDING else f"{value:+.{digits}f}".replace("-", MINUS)
 
 
-def difference(mean: float | None, interval: Sequence[float] | None) -> str:
+def difference(mean: float | None, interval: Sequence[float] | None, digits: int = 3) -> str:
     """A paired difference and its interval, or a dash.
 
     Examples:
@@ -159,7 +159,7 @@ def difference(mean: float | None, interval: Sequence[float] | None) -> str:
     """
     if mean is None or interval is None:
         return MISSING
-    return f"{signed(mean)} [{signed(interval[0])}, {signed(interval[1])}]"
+    return f"{signed(mean, digits)} [{signed(interval[0], digits)}, {signed(interval[1], digits)}]"
 
 
 def duration(seconds: float) -> str:

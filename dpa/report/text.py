@@ -5,22 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
-from dpa.report.experiment import Comparison, Experiment, decoding_of
+from dpa.report.experiment import Comparison, Experiment, decoding_of, in_words
 from dpa.report.findings import budgets, chosen_on_the_same, headline, left_out, ordering, saturated
+from dpa.report.likelihoods import ABOUT_LEARNT, LEARNT, Learnt, likelihoods, shown_figures, who_learns
+from dpa.report.matched import matched
 from dpa.report.paired import paired_figure
-from dpa.report.sections.likelihood import DIGITS, FIGURES
 from dpa.report.sections.safety import groups_of
+from dpa.report.statistics import Interval
 from dpa.report.study import Evaluations, Study
 from dpa.report.table import (
     COLUMNS,
     MISSING,
+    REFERENCE,
     cells,
     difference,
     duration,
     header,
     measured,
     number,
-    summarise,
     to_markdown,
 )
 
@@ -68,9 +70,18 @@ def _experiment(experiment: Experiment, evaluations: Evaluations) -> Iterator[st
     if "common" in compared:
         yield "**All at the common decoding**, and the reference at the others:"
         yield comparison_table(experiment, experiment.at_common)
+    if told := sharpness_table(experiment, evaluations):
+        yield (
+            "**At equal sharpness**, on the tuning scenes: realism minus that of the reference where its rollouts lie "
+            "as far apart, between two of its decodings; a dash where none of them does:"
+        )
+        yield told
     if experiment.likelihood:
+        if learnt := who_learns(experiment, evaluations):
+            yield f"**Who learns the ranking** (table 3); {ABOUT_LEARNT}:"
+            yield learnt_table(learnt)
         yield "**Likelihood** of the reference's ranked rollouts, per token [nats]; KL along rollouts of the method:"
-        yield likelihood_table(experiment)
+        yield likelihood_table(experiment, evaluations)
 
 
 def comparison_table(experiment: Experiment, comparison: Comparison) -> str:
@@ -116,8 +127,7 @@ def safety_table(experiment: Experiment, comparison: Comparison, evaluations: Ev
         cells = []
         for key in shown:
             found = None if mine == base else paired_figure(mine, base, key, evaluations)
-            change = "" if found is None else f" ({difference(found.mean, (found.low, found.high))})"
-            cells.append(number(record.get(key), 3) + change)
+            cells.append(_with_change(number(record.get(key), 3), found))
         rows.append([experiment.labels[record["method"]], *cells])
     return to_markdown(["method", *(names[key] for key in shown)], rows)
 
@@ -134,19 +144,56 @@ def _published(experiment: Experiment, titles: Sequence[str]) -> Iterator[list[s
         yield [f"*paper: {experiment.labels[method]}*", *cells]
 
 
-def likelihood_table(experiment: Experiment) -> str:
-    """Means over seeds of what every method thinks of ranked rollouts and logs.
+def sharpness_table(experiment: Experiment, evaluations: Evaluations) -> str | None:
+    """Realism of every method and decoding minus that of the reference where its rollouts lie as far apart.
+
+    Args:
+        experiment: that tried several decodings.
+        evaluations: figures of every scene.
+
+    Returns:
+        Markdown; None where no method has a decoding as sharp as one of the reference's.
+    """
+    grid, rows = experiment.grid(), []
+    for method in experiment.methods:
+        found = [matched(experiment, method, decoding, evaluations) for decoding in grid]
+        if method != REFERENCE and any(found):
+            rows.append([experiment.labels[method], *map(_change, found)])
+    return to_markdown(["method", *map(in_words, grid)], rows) if rows else None
+
+
+def likelihood_table(experiment: Experiment, evaluations: Evaluations) -> str:
+    """Means over seeds of what every method thinks of ranked rollouts and logs, and the change from the reference.
 
     Args:
         experiment: with rows of likelihood.
+        evaluations: figures of every scene; without them the differences are left out.
     """
-    records = summarise(experiment.likelihood)
-    shown = measured(records, FIGURES)
     rows = [
-        [experiment.labels[record["method"]], *(number(record[key], DIGITS.get(key, 3)) for key in shown)]
-        for record in records
+        [experiment.labels[method], *(_with_change(number(c.mean, c.digits), c.change, c.digits) for c in cells)]
+        for method, cells in likelihoods(experiment, evaluations).items()
     ]
-    return to_markdown(["method", *(FIGURES[key] for key in shown)], rows)
+    return to_markdown(["method", *shown_figures(experiment).values()], rows)
+
+
+def learnt_table(learnt: Learnt) -> str:
+    """Table 3 of the paper, with its own numbers beside ours.
+
+    Args:
+        learnt: see :func:`~dpa.report.likelihoods.who_learns`.
+    """
+    rows = [[name, *(number(cell.mean, cell.digits) for cell in cells)] for name, cells in learnt.means.items()]
+    rows += [[name, *map(_change, changes)] for name, changes in learnt.changes.items()]
+    rows += [[f"*paper: {name}*", *(number(each, 3) for each in paper)] for name, paper in learnt.published.items()]
+    return to_markdown(["method", *LEARNT.values()], rows)
+
+
+def _with_change(value: str, found: Interval | None, digits: int = 3) -> str:
+    return value if found is None else f"{value} ({difference(found.mean, (found.low, found.high), digits)})"
+
+
+def _change(found: Interval | None) -> str:
+    return MISSING if found is None else difference(found.mean, (found.low, found.high))
 
 
 def _made(experiment: Experiment) -> str:

@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 
 from dpa.report.experiment import Comparison, Experiment
 from dpa.report.figures import plot_comparison
-from dpa.report.sections.likelihood import FIGURES
+from dpa.report.likelihoods import FIGURES
 from dpa.report.sections.safety import MEASURES
 from dpa.report.table import REFERENCE, cells, header, measured, summarise
 from dpa.training.loggers import make_logger

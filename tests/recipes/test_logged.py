@@ -87,7 +87,9 @@ def test_safety_is_a_table_of_means_over_seeds_and_known_scenes(study: Path) -> 
 def test_likelihoods_are_the_table_of_the_page(study: Path) -> None:
     folder, found = logged(study, "csv")
     rows = rows_of(folder, "likelihood/methods")
-    titles, _, *lines = likelihood_table(read_experiment(study / "experiments/methods.json")).splitlines()
+    titles, _, *lines = likelihood_table(
+        read_experiment(study / "experiments/methods.json"), lambda file: None
+    ).splitlines()
     shown = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     assert [f" {title} " for title in rows[0]] == titles.strip("|").split("|")
     for row, (label, *numbers) in zip(rows, shown, strict=True):

@@ -729,8 +729,8 @@ def test_a_comparison_names_the_run_that_saturates_and_its_options(
         list(workers.run([Job(align_job, (cfg, 0, "smoothed"), "align 0 smoothed")], "align"))
     (told,) = warnings_in(capsys.readouterr().err)
     assert told.startswith("align 0 smoothed > dpo: ")
-    assert " Say methods.smoothed.loss.reference=true, or " in told
-    assert re.search(r" or lower methods\.smoothed\.loss\.alpha=1000\.0 to \S+\.$", told)
+    assert " Say methods.smoothed.loss.reference=true. Without it, " in told
+    assert re.search(r" or lower methods\.smoothed\.loss\.alpha=1000\.0 to \S+ saturates fewer, ", told)
 
 
 def test_a_step_is_the_same_however_it_is_split_into_parts() -> None:

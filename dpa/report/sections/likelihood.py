@@ -5,25 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from dpa.report.charts import Chart, Line, curves, gallery
 from dpa.report.curves import Curve, read_curves
 from dpa.report.experiment import Experiment
+from dpa.report.likelihoods import ABOUT_LEARNT, LEARNT, Cell, Learnt, likelihoods, shown_figures, who_learns
 from dpa.report.markup import Html, Section, element, folded, hint, joined, sources, stacked, table
-from dpa.report.paired import paired_figure, quiet_change
+from dpa.report.paired import quiet_change
 from dpa.report.study import Evaluations
-from dpa.report.table import MINUS, REFERENCE, mean_over_seeds, number
+from dpa.report.table import REFERENCE, number
 
-FIGURES = {
-    "pair_accuracy": "pair accuracy ↑", "reward_accuracy": "reward accuracy ↑",
-    "nll_preferred": "NLL preferred", "nll_unpreferred": "NLL unpreferred",
-    "nll_demonstration": "NLL log", "entropy": "entropy", "kl": "KL to reference",
-}  # fmt: skip
-DIGITS = {"kl": 4}
-"""Of a figure after the point, where it is not 3."""
 SIDES = {
     "tune/nll_preferred": ("preferred", "#2a78b5"),
     "tune/nll_unpreferred": ("unpreferred", "#d55e00"),
@@ -40,9 +33,6 @@ HEALTH = {
 """Title and axis of the figure of a scalar."""
 POINTS = 40
 """Most points of a curve on the page; longer ones are averaged over blocks of steps."""
-TABLE_3 = ("dpa_omf", "adversarial_afd")
-"""Methods of the paper's table 3."""
-OF_TABLE_3 = {"pair_accuracy": "pair accuracy ↑", "realism": "realism ↑", "min_ade": "minADE ↓"}
 
 
 def likelihood_table(experiment: Experiment, evaluations: Evaluations) -> Html:
@@ -52,30 +42,22 @@ def likelihood_table(experiment: Experiment, evaluations: Evaluations) -> Html:
         experiment: to show.
         evaluations: figures of every scene.
     """
-    by_method = {
-        method: [row for row in experiment.likelihood if row["method"] == method] for method in experiment.methods
-    }
-    by_method = {method: rows for method, rows in by_method.items() if rows}
-    shown = [key for key in FIGURES if any(row.get(key) is not None for row in experiment.likelihood)]
+    shown = shown_figures(experiment)
     if not shown:
         return Html("")
-    rows = []
-    for method, of_method in by_method.items():
-        cells = []
-        for key in shown:
-            digits, base = DIGITS.get(key, 3), by_method.get(REFERENCE, [])
-            found = None if method == REFERENCE else paired_figure(of_method, base, key, evaluations)
-            cells.append(
-                joined(
-                    [number(mean_over_seeds([row.get(key) for row in of_method]), digits), quiet_change(found, digits)],
-                    "",
-                )
-            )
-        rows.append([experiment.labels[method], *cells, sources([row["file"] for row in of_method])])
+    files = {
+        method: [row["file"] for row in experiment.likelihood if row["method"] == method]
+        for method in experiment.methods
+    }
+    rows = [
+        [experiment.labels[method], *map(_with_change, cells), sources(files[method])]
+        for method, cells in likelihoods(experiment, evaluations).items()
+    ]
+    learnt = who_learns(experiment, evaluations)
     parts = [
-        *([_table_3(experiment, by_method, evaluations)] if set(TABLE_3) <= set(by_method) else []),
+        *([] if learnt is None else [_table_3(learnt, experiment)]),
         element("h3", "Likelihood of ranked rollouts"),
-        table(["method", *(FIGURES[key] for key in shown), "seeds"], rows),
+        table(["method", *shown.values(), "seeds"], rows),
         hint(
             f"On the reference's ranked rollouts of the {experiment.reported}, means over seeds; in small type the "
             "difference from the reference with its 95 % interval. Pair accuracy: how often the nearer rollout of a "
@@ -87,33 +69,24 @@ def likelihood_table(experiment: Experiment, evaluations: Evaluations) -> Html:
     return joined(parts)
 
 
-def _table_3(
-    experiment: Experiment, by_method: Mapping[str, Sequence[Mapping[str, Any]]], evaluations: Evaluations
-) -> Html:
-    def runs(method: str, key: str) -> Sequence[Mapping[str, Any]]:
-        at_common = experiment.at_common.of(method, experiment.common)
-        return by_method.get(method, []) if key == "pair_accuracy" else at_common
+def _with_change(cell: Cell) -> Html:
+    return joined([number(cell.mean, cell.digits), quiet_change(cell.change, cell.digits)], "")
 
-    rows = []
-    for method in TABLE_3:
-        published = experiment.published.get(method, {})
-        cells = []
-        for key in OF_TABLE_3:
-            paper = [element("small", f"paper {number(published[key], 3)}")] if key in published else []
-            cells.append(joined([number(mean_over_seeds([row.get(key) for row in runs(method, key)]), 3), *paper], ""))
-        rows.append([experiment.labels[method], *cells])
-    mine = TABLE_3[0]
-    for other in (TABLE_3[1], REFERENCE):
-        changes = [paired_figure(runs(mine, key), runs(other, key), key, evaluations) for key in OF_TABLE_3]
-        cells = [stacked(None, None) if each is None else stacked(each.mean, (each.low, each.high)) for each in changes]
-        rows.append([f"{experiment.labels[mine]} {MINUS} {experiment.labels[other]}", *cells])
-    note = (
-        f"On {experiment.reported}; realism and minADE at the common decoding; pair accuracy, which depends on "
-        "none, of the checkpoint that was chosen for the best one. Differences with 95 % intervals, bold where 0 lies "
-        "outside."
-    )
+
+def _table_3(learnt: Learnt, experiment: Experiment) -> Html:
+    rows: list[list[object]] = []
+    for name, cells in learnt.means.items():
+        papers = (
+            Html("") if each is None else element("small", f"paper {number(each, 3)}")
+            for each in learnt.published[name]
+        )
+        values = (number(cell.mean, cell.digits) for cell in cells)
+        rows.append([name, *(joined(each, "") for each in zip(values, papers, strict=True))])
+    for name, changes in learnt.changes.items():
+        rows.append([name, *(stacked(None, None) if c is None else stacked(c.mean, (c.low, c.high)) for c in changes)])
+    note = f"On {experiment.reported}; {ABOUT_LEARNT}. Differences with 95 % intervals, bold where 0 lies outside."
     head = element("h3", "Who learns the ranking (table 3)")
-    return joined([head, table(["method", *OF_TABLE_3.values()], rows), hint(note)])
+    return joined([head, table(["method", *LEARNT.values()], rows), hint(note)])
 
 
 def training_section(

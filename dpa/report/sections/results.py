@@ -24,12 +24,14 @@ from dpa.report.markup import (
     table,
     tabs,
 )
+from dpa.report.matched import matched
 from dpa.report.paired import paired_figure, quiet_change
 from dpa.report.sections.likelihood import likelihood_table
 from dpa.report.sections.safety import safety_tables
 from dpa.report.sections.scaling import scaling_charts
+from dpa.report.statistics import Interval
 from dpa.report.study import FIRST, Evaluations
-from dpa.report.table import COLUMNS, MISSING, REFERENCE, duration, number, signed
+from dpa.report.table import COLUMNS, MISSING, REFERENCE, difference, duration, number, signed
 
 DPO = {
     "kind": "contrastive", "link": "logistic", "reference": True, "conservative": 1.0, "score_reduction": "sum",
@@ -54,7 +56,7 @@ def experiment_section(experiment: Experiment, colours: Mapping[str, str], evalu
         differences(experiment),
         versus(experiment),
         *scaling_charts(experiment, colours),
-        *matched_curves(experiment, colours),
+        *matched_curves(experiment, colours, evaluations),
     ]
     about = [
         _scenes(experiment),
@@ -107,8 +109,14 @@ def versus(experiment: Experiment) -> Chart | None:
     return forest({kind: found}, title, x=f"difference in realism to {standard}", caption=caption)
 
 
-def matched_curves(experiment: Experiment, colours: Mapping[str, str]) -> list[Chart]:
-    """Realism against the spread of rollouts, over the decodings tried: methods compare at equal sharpness."""
+def matched_curves(experiment: Experiment, colours: Mapping[str, str], evaluations: Evaluations) -> list[Chart]:
+    """Realism against the spread of rollouts, over the decodings tried: methods compare at equal sharpness.
+
+    Args:
+        experiment: to show.
+        colours: of its methods.
+        evaluations: figures of every scene, for the intervals.
+    """
     content = []
     for method in experiment.methods:
         records = Comparison([row for row in experiment.tuning if row["method"] == method], []).records()
@@ -117,6 +125,10 @@ def matched_curves(experiment: Experiment, colours: Mapping[str, str]) -> list[C
         if not known:
             continue
         label, chosen = experiment.labels[method], experiment.chosen.get(method)
+        above = [
+            None if method == REFERENCE else matched(experiment, method, decoding_of(record), evaluations)
+            for record in known
+        ]
         content.append(
             Line(
                 label,
@@ -128,9 +140,11 @@ def matched_curves(experiment: Experiment, colours: Mapping[str, str]) -> list[C
                         label + (", chosen" if decoding_of(record) == chosen else ""),
                         f"{in_words(decoding_of(record))}, {record['n_seeds']} seeds",
                         f"realism {number(record['realism'], 3)}, spread {number(record['spread'], 2)} m",
+                        *([f"{difference(found.mean, (found.low, found.high))} at equal sharpness"] if found else []),
                     )
-                    for record in known
+                    for record, found in zip(known, above, strict=True)
                 ],
+                error=_reach(above),
                 dash="dot" if method == REFERENCE else "solid",
                 markers=[15 if decoding_of(record) == chosen else 6 for record in known],
                 opacity=0.45 if "@" in method else 1.0,
@@ -140,10 +154,20 @@ def matched_curves(experiment: Experiment, colours: Mapping[str, str]) -> list[C
         return []
     caption = (
         "Every decoding of the grid, mean over seeds; the large marker is the one chosen. Left is sharper sampling. A "
-        "method that only samples more sharply lies on the line of the reference."
+        "method that only samples more sharply lies on the line of the reference; bars are 95 % intervals of how far "
+        "above that line a point lies: one that does not reach it is told apart."
     )
     title = "Realism against sharpness of sampling, tuning scenes"
     return [curves(content, title, x="distance between the rollouts of a scene [m]", y="realism", caption=caption)]
+
+
+def _reach(above: Sequence[Interval | None]) -> tuple[list[float], list[float]] | None:
+    """How far bars reach up and down from points above or below a line; none where nothing is compared."""
+    if not any(above):
+        return None
+    found = [(0.0, 0.0) if each is None else (each.high - each.mean, each.mean - each.low) for each in above]
+    up, down = zip(*found, strict=True)
+    return list(up), list(down)
 
 
 def _panel(experiment: Experiment, comparison: Comparison, evaluations: Evaluations) -> Html:

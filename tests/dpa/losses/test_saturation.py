@@ -85,9 +85,15 @@ def test_a_resumed_watch_finds_what_an_uninterrupted_one_does() -> None:
 def test_options_are_named_where_the_command_has_them() -> None:
     text = SaturationWatch(PLAIN, "methods.cpl.loss")(0, figures(0.9))
     assert text.endswith(
-        "Say methods.cpl.loss.reference=true, or say methods.cpl.loss.score_reduction=token_mean, or lower "
-        "methods.cpl.loss.alpha=0.1 to 0.01."
+        "Say methods.cpl.loss.reference=true. Without it, to say methods.cpl.loss.score_reduction=token_mean, or lower "
+        "methods.cpl.loss.alpha=0.1 to 0.01 saturates fewer, but those whose preferred rollout was improbable still "
+        "weigh most."
     )
+
+
+def test_a_hinge_is_told_of_pairs_far_from_its_corner_and_a_squared_link_never() -> None:
+    assert "how likely their rollouts are" in (SaturationWatch({**PLAIN, "link": "hinge"})(0, figures(0.9)) or "")
+    assert not said(SaturationWatch({**PLAIN, "link": "squared"}), [1.0] * 30)
 
 
 def test_imitation_is_never_told_off() -> None:
@@ -98,8 +104,9 @@ def test_imitation_is_never_told_off() -> None:
 @pytest.mark.parametrize(
     ("options", "mean", "std", "advice"),
     [
-        (PLAIN, 0.0, 10.0, "Say method.loss.reference=true, or say method.loss.score_reduction=token_mean, or lower "
-         "method.loss.alpha=0.1 to 0.01."),
+        (PLAIN, 0.0, 10.0, "Say method.loss.reference=true. Without it, to say method.loss.score_reduction=token_mean, "
+         "or lower method.loss.alpha=0.1 to 0.01 saturates fewer, but those whose preferred rollout was improbable "
+         "still weigh most."),
         ({**PLAIN, "reference": True}, 3.0, 4.0, "Say method.loss.score_reduction=token_mean, or lower "
          "method.loss.alpha=0.1 to 0.02."),
         ({**PLAIN, "reference": True, "score_reduction": "token_mean"}, 50.0, 0.0, "Lower method.loss.alpha=0.1 to "

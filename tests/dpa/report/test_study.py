@@ -13,15 +13,17 @@ import numpy as np
 import pytest
 
 from dpa.report.charts import _rounded
+from dpa.report.experiment import Comparison
+from dpa.report.matched import matched_difference
 from dpa.report.page import write_study
 from dpa.report.sections.results import DPO
 from dpa.report.statistics import paired_bootstrap
-from dpa.report.study import read_study
+from dpa.report.study import Evaluations, read_study
 from dpa.report.table import difference, number, signed
 from recipes import report as recipe
 from recipes.report import report
 from tests.dpa.report.parsed import Page
-from tests.dpa.report.runs import AXIS, BEST, COMMON, SEEDS, label, values, write, write_experiment
+from tests.dpa.report.runs import AXIS, BEST, COMMON, GRID, SEEDS, label, values, write, write_experiment
 
 
 @pytest.fixture(scope="module")
@@ -225,7 +227,7 @@ def test_the_forest_holds_every_interval_with_its_seeds(page: Page, methods: dic
 
 
 def test_decoding_matched_curves_have_realism_over_spread_and_mark_the_chosen_decoding(
-    page: Page, methods: dict[str, Any]
+    page: Page, methods: dict[str, Any], runs: Path
 ) -> None:
     figure = figures(page, "distance between the rollouts of a scene [m]")[0]
     line = trace(figure, "DPA-OMF")
@@ -234,6 +236,17 @@ def test_decoding_matched_curves_have_realism_over_spread_and_mark_the_chosen_de
     assert line["x"][place] == _rounded(mean(methods["tuning"], "dpa_omf", "spread", BEST))
     assert line["y"][place] == _rounded(mean(methods["tuning"], "dpa_omf", "realism", BEST))
     assert "DPA-OMF, chosen" in line["hovertext"][place]
+    files = Evaluations(runs)
+    tuned = Comparison(methods["tuning"], [])
+    base = [tuned.of("reference", decoding) for decoding in GRID]
+    at = {_rounded(mean(methods["tuning"], "dpa_omf", "spread", each)): each for each in GRID}
+    bars = zip(line["error_y"]["array"], line["error_y"]["arrayminus"], strict=True)
+    for x, hover, (up, down) in zip(line["x"], line["hovertext"], bars, strict=True):
+        found = matched_difference(tuned.of("dpa_omf", at[x]), base, files)
+        reach = (0, 0) if found is None else (found.high - found.mean, found.mean - found.low)
+        assert (up, down) == pytest.approx(reach, rel=1e-4)
+        assert ("at equal sharpness" in hover) == (found is not None)
+    assert any(line["error_y"]["array"]) and "error_y" not in trace(figure, "reference")
 
 
 def test_table_3_has_pair_accuracy_realism_and_min_ade(page: Page, methods: dict[str, Any]) -> None:
@@ -444,9 +457,13 @@ def test_methods_that_train_on_more_are_named(copied: Path, tmp_path: Path) -> N
 
 def test_methods_whose_loss_saturated_are_named_with_their_seeds(page: Page, copied: Path, tmp_path: Path) -> None:
     for seed in SEEDS:
-        kept = {"saturated": "60 % of the pairs are saturated since step 1"} if seed else {}
-        for method, more in (("dpa_omf", {}), ("dpa_adef", kept)):
-            write(copied / f"seed_{seed}" / method / "result.json", {"options": {}, **more})
+        for method, share in (("dpa_omf", 0.4), ("dpa_adef", 0.6 if seed else 0.4), ("adversarial_afd", None)):
+            run = copied / f"seed_{seed}" / method
+            write(run / "result.json", {"options": {"loss": {"link": "logistic", "alpha": 0.1}}})
+            watched = {"saturated": share, "weight_mean": 0.5, "weight_std": 0.5, "logit_mean": 0.0, "logit_std": 9.0}
+            for name, value in {} if share is None else watched.items():
+                points = (f"{step},{value}\n" for step in range(1, 61))
+                (run / "scalars/train" / f"{name}.csv").write_text("".join(points), encoding="utf-8")
     told = "Saturated: DPA-ADEF (2 of 3 seeds)."
     assert Page(report(copied, tmp_path / "out").read_text(encoding="utf-8")).text.count(told) == 1
     assert report(copied, tmp_path / "tables.md").read_text(encoding="utf-8").count(told) == 1

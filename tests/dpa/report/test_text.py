@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpa.report.experiment import read_experiment
+from dpa.report.experiment import Comparison, in_words, read_experiment
+from dpa.report.matched import matched_difference
 from dpa.report.statistics import paired_bootstrap
-from dpa.report.table import difference, number
+from dpa.report.study import Evaluations
+from dpa.report.table import MISSING, difference, number
 from recipes.report import report
-from tests.dpa.report.runs import BEST, COMMON, SEEDS, values, write_experiment, write_runs
+from tests.dpa.report.runs import BEST, COMMON, GRID, SEEDS, values, write_experiment, write_runs
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +101,39 @@ def test_likelihoods_are_means_over_seeds(runs: Path, text: str) -> None:
     methods = read_experiment(runs / "experiments" / "methods.json")
     mine = [row["nll_preferred"] for row in methods.likelihood if row["method"] == "dpa_omf"]
     table = rows_of(block(text, methods.title), "**Likelihood**")
-    assert table["DPA-OMF"]["NLL preferred"] == [number(sum(mine) / len(mine), 3)]
+    assert table["DPA-OMF"]["NLL preferred"] == [f"{number(sum(mine) / len(mine), 3)} (−0.300 [−0.300, −0.300])"]
+    assert table["reference"]["NLL preferred"] == ["2.000"]
+
+
+def test_table_3_has_both_learners_their_differences_and_the_papers(text: str, runs: Path) -> None:
+    methods = read_experiment(runs / "experiments" / "methods.json")
+    table = rows_of(block(text, methods.title), "**Who learns the ranking**")
+    assert list(table) == [
+        "DPA-OMF", "adversarial AFD", "DPA-OMF − adversarial AFD", "DPA-OMF − reference", "*paper: DPA-OMF*",
+        "*paper: adversarial AFD*",
+    ]  # fmt: skip
+    assert [row["pair accuracy ↑"] for row in table.values()] == [
+        ["0.650"], ["0.510"], ["+0.140 [+0.140, +0.140]"], ["+0.140 [+0.140, +0.140]"], ["0.840"], ["–"],
+    ]  # fmt: skip
+    mine, base = (np.array([values(m, s, COMMON)["realism"] for s in SEEDS]) for m in ("dpa_omf", "adversarial_afd"))
+    found = paired_bootstrap(mine, base)
+    assert table["DPA-OMF − adversarial AFD"]["realism ↑"] == [difference(found.mean, (found.low, found.high))]
+    scaling = read_experiment(runs / "experiments" / "scaling.json")
+    assert "Who learns" not in block(text, scaling.title), "its methods are not there"
+
+
+def test_equal_sharpness_has_a_difference_where_the_reference_is_as_sharp(text: str, runs: Path) -> None:
+    methods = read_experiment(runs / "experiments" / "methods.json")
+    table = rows_of(block(text, methods.title), "**At equal sharpness**")
+    assert "reference" not in table and set(table) <= set(methods.labels.values())
+    tuned, files = Comparison(methods.tuning, []), Evaluations(runs)
+    base = [tuned.of("reference", decoding) for decoding in GRID]
+    for name, cells in table.items():
+        method = next(method for method, told in methods.labels.items() if told == name)
+        for decoding in GRID:
+            found = matched_difference(tuned.of(method, decoding), base, files)
+            told = MISSING if found is None else difference(found.mean, (found.low, found.high))
+            assert cells[in_words(decoding)] == [told]
 
 
 def test_the_account_adds_up(text: str) -> None:
