@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
@@ -53,27 +53,50 @@ def run_tasks(work: Work, tasks: Sequence[Task], workers: int, tick: Callable[[i
 def _run_in_pool(work: Work, tasks: Sequence[Task], workers: int, tick: Callable[[int], Any]) -> Iterator[Task]:
     context = multiprocessing.get_context("spawn")  # a forked process would inherit the threads' locks of torch
     made = context.Value("q", 0)
-    pool = ProcessPoolExecutor(workers, context, _start_worker, (made,))
-    waiting, running, counted = iter(tasks), dict[Future, Task](), 0
+    pool, counted = ProcessPoolExecutor(workers, context, _start_worker, (made,)), 0
     try:
-        while True:
-            # A pool starts whatever it has been handed, even when it is told to stop: so no more than it has hands.
-            for task in islice(waiting, workers - len(running)):
-                running[pool.submit(_work_and_count, work, task)] = task
-            if not running:
-                break
-            done, _ = wait(running, _POLL_SECONDS, FIRST_COMPLETED)
+        for lot in lots_done(lambda task: pool.submit(_work_and_count, work, task), tasks, workers, _POLL_SECONDS):
             tick(made.value - counted)
             counted = made.value
-            for future in done:
+            for task, future in lot:
                 future.result()
-                yield running.pop(future)
+                yield task
     except BrokenProcessPool as error:
         raise SceneError(
             "a worker was killed, perhaps for want of memory; run it again with fewer workers or smaller shards."
         ) from error
     finally:
         pool.shutdown()
+
+
+def lots_done(
+    submit: Callable[[Task], Future], tasks: Iterable[Task], workers: int, seconds: float | None = None
+) -> Iterator[list[tuple[Task, Future]]]:
+    """Keep every worker of a pool at work, and give back what is done, in any order.
+
+    A pool starts whatever it has been handed, even when it is told to stop; so it is handed no more than it has hands.
+
+    Args:
+        submit: hands a task to the pool.
+        tasks: taken one at a time, when a worker is free; once they end, what is under way is waited for.
+        workers: of the pool.
+        seconds: to wait at most until the next lot, which may then be empty; None waits until a task is done.
+
+    Examples:
+        >>> from concurrent.futures import ThreadPoolExecutor
+        >>> with ThreadPoolExecutor(2) as pool:
+        ...     lots = list(lots_done(lambda task: pool.submit(abs, task), [-1, -2, -3], workers=2))
+        >>> sorted((task, future.result()) for lot in lots for task, future in lot)
+        [(-3, 3), (-2, 2), (-1, 1)]
+    """
+    waiting, running = iter(tasks), dict[Future, Task]()
+    while True:
+        for task in islice(waiting, workers - len(running)):
+            running[submit(task)] = task
+        if not running:
+            return
+        done = wait(running, seconds, FIRST_COMPLETED).done
+        yield [(running.pop(future), future) for future in done]
 
 
 _made: Any = None

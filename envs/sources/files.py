@@ -69,9 +69,11 @@ def _find_remote(path: str, patterns: Sequence[str]) -> tuple[list[str], bool]:
         is_folder = system.isdir(inner)
         names = []
         for match in [inner] if is_folder else sorted(system.glob(inner)):
-            below = system.find(match) if system.isdir(match) else []
-            fitting = [name for name in below if any(fnmatch(PurePosixPath(name).name, each) for each in patterns)]
-            names += sorted(fitting) if system.isdir(match) else [match]
+            if system.isdir(match):
+                below = system.find(match)
+                names += sorted(n for n in below if any(fnmatch(PurePosixPath(n).name, each) for each in patterns))
+            else:
+                names.append(match)
         return list(dict.fromkeys(map(system.unstrip_protocol, names))), is_folder
 
 

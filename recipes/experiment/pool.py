@@ -6,16 +6,16 @@ import multiprocessing
 import os
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from itertools import islice
+from itertools import takewhile
 from typing import Any, NamedTuple
 
 import torch
 
 from envs.allocator import keep_freed_memory
 from envs.progress import message, progress, stage, use_line
-from envs.workers import end_with_parent
+from envs.workers import end_with_parent, lots_done
 
 
 class Job(NamedTuple):
@@ -80,26 +80,21 @@ class Workers:
             for job in progress(jobs, name, unit="job"):
                 yield job.name, *_work(job, self.threads)
             return
-        waiting, running = iter(jobs), dict[Future, str]()
-        failed: BaseException | None = None
+        pool, failed = self._pool, None
+        wanted = takewhile(lambda _: failed is None, jobs)
         with progress(total=len(jobs), description=name, unit="job") as bar:
-            while True:
-                # A pool starts whatever it has been handed, even when it is told to stop: so no more than it has hands.
-                for job in islice(waiting, 0 if failed else self.count - len(running)):
-                    running[self._pool.submit(_work, job, self.threads)] = job.name
-                if not running:
-                    break
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    job_name, error = running.pop(future), future.exception()
+            for lot in lots_done(lambda job: pool.submit(_work, job, self.threads), wanted, self.count):
+                for job, future in lot:
+                    error = future.exception()
                     if error is None:
-                        yield job_name, *future.result()
+                        yield job.name, *future.result()
                     elif isinstance(error, BrokenProcessPool):
                         raise ChildProcessError(
                             f"a worker of {name!r} was killed, perhaps for want of memory; run it again with workers=1."
                         ) from error
                     elif failed is None:
                         failed = error
-                        message(f"{job_name}: {failed} (jobs under way end first)")
+                        message(f"{job.name}: {failed} (jobs under way end first)")
                     bar.update()
         if failed is not None:
             raise failed
