@@ -23,7 +23,7 @@ from envs.store import SceneStore
 from recipes.common.cli import build, finished, plain
 from recipes.common.models import open_policy, policies_of, weights_digest
 from recipes.common.partial import PartialResult
-from recipes.common.provenance import pasteable
+from recipes.common.provenance import provenance
 from recipes.common.rankings import build_distance
 from recipes.common.rolled import Rolled, rolled
 from recipes.common.scenes import fingerprint
@@ -157,7 +157,7 @@ def random_groups(each: Rolled, size: int, seed: int, study: str) -> list[Tensor
 
 
 def how_made(cfg: DictConfig, recipe: str, scenes: SceneStore, measured: dict[str, list[dict]]) -> dict[str, Any]:
-    """What a reader of a study needs to make it again: command, sizes and configuration.
+    """What a reader of a study needs to make it again: command, code, machine, sizes and configuration.
 
     Args:
         cfg: of the study.
@@ -166,7 +166,7 @@ def how_made(cfg: DictConfig, recipe: str, scenes: SceneStore, measured: dict[st
         measured: what :func:`study` gave.
     """
     return {
-        "command": pasteable(recipe),
+        **provenance(recipe, cfg.device),
         "scenes": len(scenes),
         "policies": list(measured),
         "num_rollouts": cfg.num_rollouts,

@@ -9,21 +9,34 @@ from typing import Any
 
 from dpa.report.experiment import SPLITS
 from dpa.report.markup import Html, Section, command, element, facts, folded, hint
+from dpa.report.table import MISSING
 
 
 def origin(name: str, found: Mapping[str, Any]) -> Html:
-    """File, command and configuration of a study.
+    """Files, command, code, machine and configuration of a study.
 
     Args:
         name: of the study.
         found: its summary.
     """
     made = found["made"]
-    numbers = facts(
-        {"numbers": element("code", f"{name}/summary.json"), "of each scene": element("code", f"{name}/*.json")}
-    )
+    named = {"numbers": element("code", f"{name}/summary.json"), "of each scene": element("code", f"{name}/*.json")}
+    named |= code_of(made.get("date"), made.get("revision"), made.get("machine"), made.get("versions", {}))
     config = element("pre", json.dumps(made["config"], indent=2, ensure_ascii=False, allow_nan=False))
-    return folded("command and configuration", command(made["command"]), numbers, folded("configuration", config))
+    parts = [command(made["command"]), facts(named), folded("configuration", config)]
+    return folded("command, configuration, versions and machine", *parts)
+
+
+def code_of(
+    date: str | None, revision: str | None, machine: str | None, versions: Mapping[str, str]
+) -> dict[str, Html | str]:
+    """What ran, when and where, for :func:`~dpa.report.markup.facts`; a dash for what was not kept."""
+    return {
+        "date": date or MISSING,
+        "code": element("code", revision) if revision else MISSING,
+        "machine": machine or MISSING,
+        "versions": ", ".join(f"{name} {version}" for name, version in versions.items()) or MISSING,
+    }
 
 
 def scope(found: Mapping[str, Any]) -> Html:

@@ -27,6 +27,7 @@ from dpa.report.markup import (
 from dpa.report.matched import matched
 from dpa.report.paired import paired_figure, quiet_change
 from dpa.report.sections.likelihood import likelihood_table
+from dpa.report.sections.origin import code_of
 from dpa.report.sections.safety import safety_tables
 from dpa.report.sections.scaling import scaling_charts
 from dpa.report.statistics import Interval
@@ -282,12 +283,9 @@ def _made(experiment: Experiment) -> Html:
     """Command, budgets, versions and configuration of an experiment."""
     named = {
         "numbers": element("code", f"experiments/{experiment.path.name}"),
-        "date": experiment.date or MISSING,
-        "code": element("code", experiment.revision) if experiment.revision else MISSING,
-        "machine": experiment.machine or MISSING,
+        **code_of(experiment.date, experiment.revision, experiment.machine, experiment.versions),
         "worker time": duration(experiment.worker_seconds),
         "stages": ", ".join(f"{name} {duration(spent)}" for name, spent in experiment.stages.items()) or MISSING,
-        "versions": ", ".join(f"{name} {version}" for name, version in experiment.versions.items()),
     }
     config = json.dumps(experiment.config, indent=2, ensure_ascii=False, allow_nan=False)
     parts = [command(experiment.command), facts(named), _budget(experiment)]

@@ -213,7 +213,10 @@ ROLLOUTS = 16
 def made(recipe: str, measured: dict[str, list[dict]]) -> dict[str, Any]:
     """How a study says that it was made."""
     return how_made(
-        OmegaConf.create({"seed": 0, "num_rollouts": ROLLOUTS, "split": "tune"}), recipe, ["s"] * SCENES, measured
+        OmegaConf.create({"seed": 0, "device": "cpu", "num_rollouts": ROLLOUTS, "split": "tune"}),
+        recipe,
+        ["s"] * SCENES,
+        measured,
     )
 
 

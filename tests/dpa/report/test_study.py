@@ -360,6 +360,19 @@ def test_what_a_discriminator_ranks_by_is_a_table_with_the_answer_below(page: Pa
     assert "Held-out AUC for each policy: 0 0.910." in page.text
 
 
+def test_studies_say_which_code_made_them_and_on_what(page: Page, runs: Path, copied: Path, tmp_path: Path) -> None:
+    made = read(runs, "validity/summary.json")["made"]
+    versions = ", ".join(f"{name} {version}" for name, version in made["versions"].items())
+    for told_ in (made["date"], made["revision"], made["machine"], versions):
+        assert page.text.count(str(told_)) >= 3, "in each of the studies"
+    older = read(copied, "validity/summary.json")
+    for key in ("date", "revision", "machine", "versions"):
+        del older["made"][key]
+    write(copied / "validity/summary.json", older)
+    again = Page(report(copied, tmp_path / "out").read_text(encoding="utf-8"))
+    assert again.text.count(versions) == page.text.count(versions) - 1, "what was not kept is a dash, not a guess"
+
+
 def told(value: dict[str, Any]) -> str:
     return difference(value["mean"], value["ci95"])
 
