@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -87,13 +88,15 @@ def policies_of(cfg: DictConfig) -> dict[str, Path]:
     """Files of the policies that ``cfg.policies`` lists.
 
     Args:
-        cfg: with ``policies``, a path or a list of them.
+        cfg: with ``policies``, a path or a list of them. A path may have the wildcards of a shell, as in
+            ``runs/study/seed_*/reference/policy.pt``: the references of all seeds of a study.
 
     Returns:
-        By the name of their run's folder, or by their whole path where that is not enough.
+        By the name of their run's folder, or by their whole path where that is not enough; those of a wildcard in
+        order of name.
 
     Raises:
-        ValueError: it lists none.
+        ValueError: it lists none, or nothing is like a wildcard.
 
     Examples:
         >>> cfg = DictConfig({"policies": ["runs/pretrain/policy.pt", "runs/dpa_omf/policy.pt"]})
@@ -103,11 +106,22 @@ def policies_of(cfg: DictConfig) -> dict[str, Path]:
         >>> list(policies_of(cfg))
         ['seed_0/dpa_omf/policy.pt', 'seed_1/dpa_omf/policy.pt']
     """
-    paths = [cfg.policies] if isinstance(cfg.policies, str) else list(cfg.policies)
+    entries = [cfg.policies] if isinstance(cfg.policies, str) else cfg.policies
+    paths = [path for entry in entries for path in _like(entry)]
     if not paths:
         raise ValueError("policies=[] names no policy; say for example policies=[runs/pretrain/policy.pt].")
     names = [Path(path).absolute().parent.name for path in paths]
     return dict(zip(names if len({*names}) == len(names) else paths, map(Path, paths), strict=True))
+
+
+def _like(path: str) -> list[str]:
+    """The file itself, or those that are like it where its name has wildcards."""
+    if not glob.has_magic(path) or Path(path).exists():
+        return [path]
+    found = sorted(glob.glob(path))
+    if not found:
+        raise ValueError(f"policies: no file is like {path}; check the folder, or give the files by name.")
+    return found
 
 
 def weights_digest(model: torch.nn.Module) -> str:

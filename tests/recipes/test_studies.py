@@ -25,7 +25,7 @@ from envs.scene import CURRENT_STEP
 from envs.sources.synthetic import straight_road
 from recipes import validity
 from recipes.common.cli import CONFIG
-from recipes.common.models import build_policy, policy_config, write_policy
+from recipes.common.models import build_policy, policies_of, policy_config, write_policy
 from recipes.ladder import BESIDES, table, tokenized_log
 from recipes.sensitivity import Variants
 from recipes.sensitivity import summarise as summarise_variants
@@ -47,6 +47,21 @@ def policies(tmp_path_factory: pytest.TempPathFactory) -> str:
         (folder / str(seed)).mkdir()
         write_policy(folder / f"{seed}/policy.pt", build_policy(config), config, {})
     return f"policies=[{folder}/0/policy.pt,{folder}/1/policy.pt]"
+
+
+def test_policies_are_named_one_by_one_or_by_a_wildcard(tmp_path: Path) -> None:
+    files = [tmp_path / f"seed_{seed}/reference/policy.pt" for seed in (10, 0, 1)]
+    odd = tmp_path / "odd[1]/policy.pt"
+    for file in (*files, odd):
+        file.parent.mkdir(parents=True)
+        file.touch()
+    like = f"{tmp_path}/seed_*/reference/policy.pt"
+    for given in (like, [like]):
+        assert list(policies_of(OmegaConf.create({"policies": given})).values()) == sorted(files)
+    both = policies_of(OmegaConf.create({"policies": [str(odd), like]}))
+    assert list(both.values()) == [odd, *sorted(files)], "a file that is there is no wildcard"
+    with pytest.raises(ValueError, match=r"no file is like .*round_\*/policy\.pt; check the folder"):
+        policies_of(OmegaConf.create({"policies": f"{tmp_path}/round_*/policy.pt"}))
 
 
 # --- validity -------------------------------------------------------------------------------------------------------

@@ -31,8 +31,8 @@ def missing_section(study: Study, experiments: Iterable[str]) -> Section | None:
         for name in experiments
         if name not in study.experiments
     }
-    references = sorted(folder.glob("seed_*/reference/policy.pt")) or ["POLICY.pt"]
-    policies = ",".join(map(str, references))
+    references = "seed_*/reference/policy.pt"
+    policies = folder / references if any(folder.glob(references)) else "POLICY.pt"
     lacking |= {
         name: shlex.join(
             ["python", "-m", f"recipes.{name}", *_scenes(study), f"policies=[{policies}]", f"output={folder / name}"]
