@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,16 @@ from omegaconf import DictConfig
 from dpa.report.experiment import Comparison, Experiment
 from dpa.report.figures import plot_comparison
 from dpa.report.likelihoods import FIGURES
+from dpa.report.matched import matched
+from dpa.report.scenes import read_scene_cards
 from dpa.report.sections.safety import MEASURES
+from dpa.report.stills import draw_charts, experiment_charts
+from dpa.report.study import Evaluations
 from dpa.report.table import REFERENCE, cells, header, measured, summarise
 from dpa.training.loggers import make_logger
 from recipes.common.cli import plain
 from recipes.evaluate import SCENE_FIGURES
+from recipes.experiment.runs import RunFolder
 
 DECODING = {"top_p": "top-p", "temperature": "temperature"}
 SAFETY = {key: f"{title} ↓" for key, title in MEASURES.items()}
@@ -32,27 +38,38 @@ def log_experiment(cfg: DictConfig, experiment: Experiment, pictures: Mapping[st
     """Log an experiment's tables, its numbers, the picture of its differences, and those that were drawn of it.
 
     Args:
-        cfg: with the section ``logger``.
+        cfg: with the section ``logger``, and ``output``, the folder of the study.
         experiment: to log.
         pictures: files by the names that they have in the logs.
 
     Returns:
         The folder of the logs.
     """
-    folder = experiment.path.with_suffix("")
+    folder, runs = experiment.path.with_suffix(""), RunFolder(Path(cfg.output))
     logs = make_logger(cfg.logger.backend, folder, plain(cfg), name=experiment.name, mode=cfg.logger.mode)
     with closing(logs) as logger, tempfile.TemporaryDirectory() as drawn:
-        for name, (titles, rows) in _tables(experiment):
+        for name, (titles, rows) in _tables(experiment, runs):
             logger.table(name, titles, rows, 0)
         logger.log({name: value for name, value in _numbers(experiment) if value is not None}, 0)
         differences = Path(drawn) / "differences.png"
         plot_comparison(experiment, differences)
-        for name, picture in {"own_best/differences": differences, **pictures}.items():
+        figures = _figures(experiment, runs.root, Path(drawn))
+        shown = {"own_best/differences": differences, **figures, **pictures}
+        for name, picture in shown.items():
             logger.picture(name, picture, 0)
     return folder
 
 
-def _tables(experiment: Experiment) -> Iterator[tuple[str, Cells]]:
+def _figures(experiment: Experiment, study: Path, drawn: Path) -> dict[str, Path]:
+    """The page's figures, drawn into a folder, by the names that they have in the logs."""
+    charts = experiment_charts(experiment, study)
+    files = {f"figures/{name}": drawn / f"{name}.png" for name in charts}
+    for found, file in zip(charts.values(), files.values(), strict=True):
+        draw_charts(found, file)
+    return files
+
+
+def _tables(experiment: Experiment, runs: RunFolder) -> Iterator[tuple[str, Cells]]:
     for name, compared in _compared(experiment).items():
         records = compared.records()
         yield f"{name}/methods", (header(records), cells(records))
@@ -60,6 +77,21 @@ def _tables(experiment: Experiment) -> Iterator[tuple[str, Cells]]:
     if experiment.likelihood:
         yield "likelihood/methods", _measured(summarise(experiment.likelihood), FIGURES)
     yield "tuning/decodings", _measured(summarise(experiment.tuning), TUNING)
+    if rows := list(_matched(experiment, Evaluations(runs.root))):
+        yield "tuning/equal_sharpness", (["method", *DECODING.values(), "Δ realism", "low", "high"], rows)
+    if experiment.stages:
+        rows = [[name, _short(seconds)] for name, seconds in experiment.stages.items()]
+        yield "account/stages", (["stage", "seconds of one worker"], rows)
+    for split, card in (read_scene_cards(runs.scenes) if runs.scenes.is_file() else {}).items():
+        yield f"scenes/{split}", (["of all scenes", split], list(card.facts.items()))
+
+
+def _matched(experiment: Experiment, evaluations: Evaluations) -> Iterator[list[Any]]:
+    """Realism above the reference's at equal sharpness, where the reference was as sharp."""
+    for method, (top_p, temperature) in product(experiment.methods, experiment.grid()):
+        found = matched(experiment, method, (top_p, temperature), evaluations)
+        if method != REFERENCE and found is not None:
+            yield [method, top_p, temperature, *map(_short, (found.mean, found.low, found.high))]
 
 
 def _measured(records: Sequence[Mapping[str, Any]], figures: Mapping[str, str]) -> Cells:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,9 @@ from PIL import Image
 from tensorboard.backend.event_processing.plugin_event_accumulator import EventAccumulator
 
 from dpa.report.experiment import read_experiment
+from dpa.report.matched import matched
+from dpa.report.scenes import read_scene_cards
+from dpa.report.study import Evaluations
 from dpa.report.table import number
 from dpa.report.text import likelihood_table
 from recipes.experiment.logged import log_experiment
@@ -21,14 +25,29 @@ from tests.dpa.training.offline import wandb_history
 
 TABLES = {
     "common/methods", "common/safety", "own_best/methods", "own_best/safety", "likelihood/methods", "tuning/decodings",
+    "tuning/equal_sharpness", "account/stages", "scenes/train", "scenes/tune", "scenes/eval",
 }  # fmt: skip
-PICTURES = {"own_best/differences", "scenes/likely"}
+OF_METHODS = {name for name in TABLES if name.partition("/")[0] not in ("account", "scenes")}
+PICTURES = {
+    "own_best/differences", "scenes/likely", "figures/sharpness", "figures/likelihood", "figures/health",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_runs(tmp_path_factory.mktemp("made") / "runs")
+
+
+@pytest.fixture(scope="module")
+def files(made: Path) -> tuple[Path, dict[str, Any]]:
+    """Logs as files, which no test changes, and the experiment."""
+    return logged(made, "csv")
 
 
 @pytest.fixture
-def study(tmp_path: Path) -> Path:
-    write_runs(tmp_path / "runs")
-    return tmp_path / "runs"
+def study(made: Path, tmp_path: Path) -> Path:
+    """A study that a test may change and log."""
+    return Path(shutil.copytree(made, tmp_path / "runs", ignore=shutil.ignore_patterns("pictures", "tables")))
 
 
 @pytest.fixture
@@ -56,8 +75,8 @@ def mean_realism(rows: list[dict[str, Any]], method: str, decoding: list[float])
     return sum(values) / len(values)
 
 
-def test_files_hold_the_tables_numbers_and_picture_of_an_experiment(study: Path) -> None:
-    folder, found = logged(study, "csv")
+def test_files_hold_the_tables_numbers_and_picture_of_an_experiment(files: tuple[Path, dict[str, Any]]) -> None:
+    folder, found = files
     rows = rows_of(folder, "own_best/methods")
     assert [row["method"] for row in rows] == found["methods"]
     for row in rows:
@@ -69,8 +88,8 @@ def test_files_hold_the_tables_numbers_and_picture_of_an_experiment(study: Path)
         assert step == "0" and float(value) == pytest.approx(mean_realism(found["rows"], method, found["common"]))
 
 
-def test_safety_is_a_table_of_means_over_seeds_and_known_scenes(study: Path) -> None:
-    folder, _ = logged(study, "csv")
+def test_safety_is_a_table_of_means_over_seeds_and_known_scenes(files: tuple[Path, dict[str, Any]]) -> None:
+    folder, _ = files
     for name, decoding in (("common", COMMON), ("own_best", BEST)):
         row = next(row for row in rows_of(folder, f"{name}/safety") if row["method"] == "dpa_omf")
         assert (float(row["top-p"]), float(row["temperature"])) == decoding
@@ -84,12 +103,10 @@ def test_safety_is_a_table_of_means_over_seeds_and_known_scenes(study: Path) -> 
             assert float(row[title]) == pytest.approx(mean, rel=1e-4), (name, key)
 
 
-def test_likelihoods_are_the_table_of_the_page(study: Path) -> None:
-    folder, found = logged(study, "csv")
+def test_likelihoods_are_the_table_of_the_page(files: tuple[Path, dict[str, Any]]) -> None:
+    folder, found = files
     rows = rows_of(folder, "likelihood/methods")
-    titles, _, *lines = likelihood_table(
-        read_experiment(study / "experiments/methods.json"), lambda file: None
-    ).splitlines()
+    titles, _, *lines = likelihood_table(read_experiment(folder.with_suffix(".json")), lambda file: None).splitlines()
     shown = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     assert [f" {title} " for title in rows[0]] == titles.strip("|").split("|")
     for row, (label, *numbers) in zip(rows, shown, strict=True):
@@ -100,8 +117,8 @@ def test_likelihoods_are_the_table_of_the_page(study: Path) -> None:
         ] == numbers
 
 
-def test_every_decoding_that_was_tried_has_a_row_with_realism_and_spread(study: Path) -> None:
-    folder, found = logged(study, "csv")
+def test_every_decoding_that_was_tried_has_a_row_with_realism_and_spread(files: tuple[Path, dict[str, Any]]) -> None:
+    folder, found = files
     rows = rows_of(folder, "tuning/decodings")
     assert [row["method"] for row in rows] == [method for method in found["methods"] for _ in GRID]
     for row in rows:
@@ -111,8 +128,39 @@ def test_every_decoding_that_was_tried_has_a_row_with_realism_and_spread(study: 
             assert float(row[title]) == pytest.approx(sum(scenes) / len(scenes), rel=1e-4)
 
 
-def test_differences_to_another_method_are_numbers_beside_those_to_the_reference(study: Path) -> None:
-    folder, found = logged(study, "csv")
+def test_realism_at_equal_sharpness_is_a_table_of_what_the_page_draws(files: tuple[Path, dict[str, Any]]) -> None:
+    folder, _ = files
+    experiment = read_experiment(folder.with_suffix(".json"))
+    rows = rows_of(folder, "tuning/equal_sharpness")
+    assert rows and "reference" not in {row["method"] for row in rows}
+    for row in rows:
+        decoding = float(row["top-p"]), float(row["temperature"])
+        found = matched(experiment, row["method"], decoding, Evaluations(folder.parents[1]))
+        assert found is not None
+        told = [float(row[title]) for title in ("Δ realism", "low", "high")]
+        assert told == pytest.approx([found.mean, found.low, found.high], rel=1e-4)
+
+
+def test_hours_and_data_cards_are_tables(files: tuple[Path, dict[str, Any]], study: Path) -> None:
+    folder, found = files
+    rows = {row["stage"]: float(row["seconds of one worker"]) for row in rows_of(folder, "account/stages")}
+    assert rows == found["stages"]
+    for split, card in read_scene_cards(study / "scenes.json").items():
+        assert {row["of all scenes"]: row[split] for row in rows_of(folder, f"scenes/{split}")} == dict(card.facts)
+    (study / "scenes.json").unlink()
+    assert not (logged(study, "csv")[0] / "tables/scenes").exists(), "an older study has no cards"
+
+
+def test_figures_of_the_page_are_pictures(files: tuple[Path, dict[str, Any]]) -> None:
+    folder, _ = files
+    names = {path.parent.name for path in (folder / "pictures/figures").rglob("*.png")}
+    assert names == {"sharpness", "likelihood", "health"}, "methods along no axis have none of scaling"
+
+
+def test_differences_to_another_method_are_numbers_beside_those_to_the_reference(
+    files: tuple[Path, dict[str, Any]],
+) -> None:
+    folder, found = files
     for entry in found["own_best"]["versus"]:
         ends = {"difference": entry["realism_difference"], "low": entry["ci95"][0], "high": entry["ci95"][1]}
         for end, value in ends.items():
@@ -121,9 +169,10 @@ def test_differences_to_another_method_are_numbers_beside_those_to_the_reference
     assert {path.stem for path in (folder / "scalars/own_best/realism_low").iterdir()} == set(found["methods"][1:])
 
 
-def test_only_pictures_that_were_drawn_of_the_experiment_are_logged(study: Path, likely: Path) -> None:
-    folder, _ = logged(study, "csv")
-    assert not (folder / "pictures/scenes").exists()
+def test_only_pictures_that_were_drawn_of_the_experiment_are_logged(
+    files: tuple[Path, dict[str, Any]], study: Path, likely: Path
+) -> None:
+    assert not (files[0] / "pictures/scenes").exists()
     folder, _ = logged(study, "csv", likely)
     assert (folder / "pictures/scenes/likely/0.png").read_bytes() == likely.read_bytes()
 
@@ -163,7 +212,8 @@ def test_wandb_gets_the_same_offline(study: Path, likely: Path) -> None:
     assert sorted((len(table["data"]), table["columns"]) for table in tables) == sorted(
         (len(rows), list(rows[0])) for rows in (rows_of(folder, name) for name in TABLES)
     )
-    assert all(table["columns"][0] == "method" and table["data"][0][0] == "reference" for table in tables)
+    of_methods = [table for table in tables if table["columns"][0] == "method"]
+    assert len(of_methods) == len(OF_METHODS)
     numbers = {path.relative_to(folder / "scalars").with_suffix("").as_posix(): path for path in curves(folder)}
     shown = {key: value for row in wandb_history(next(run.glob("*.wandb"))) for key, value in row.items()}
     assert shown.keys() >= numbers.keys() | {f"{name}/_type" for name in TABLES | PICTURES}

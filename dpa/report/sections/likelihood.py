@@ -101,13 +101,7 @@ def training_section(
     """
     parts = []
     for experiment in experiments:
-        runs = {
-            method: [read_curves(folder / run) for run in seeds.values() if (folder / run / "scalars").is_dir()]
-            for method, seeds in experiment.curves.items()
-        }
-        runs = {method: seeds for method, seeds in runs.items() if seeds}
-        charts = [chart for method, seeds in runs.items() for chart in _likelihood(experiment.labels[method], seeds)]
-        health = [chart for key in HEALTH for chart in _health(experiment, runs, key, colours[experiment.name])]
+        charts, health = training_charts(experiment, folder, colours[experiment.name])
         if charts or health:
             body = joined([gallery(charts, small=True), element("h3", "Health of the alignment"), gallery(health)])
             parts.append(folded(experiment.title, body, open_=not parts))
@@ -121,6 +115,25 @@ def training_section(
         "Each figure has a scale of its own."
     )
     return Section("training", "Likelihood along training", joined([about, *parts]))
+
+
+def training_charts(
+    experiment: Experiment, folder: Path, colours: Mapping[str, str]
+) -> tuple[list[Chart], list[Chart]]:
+    """Likelihoods of each method along its alignment, and what tells whether that goes well, all methods together.
+
+    Args:
+        experiment: to show.
+        folder: of the study.
+        colours: of the methods.
+    """
+    runs = {
+        method: [read_curves(folder / run) for run in seeds.values() if (folder / run / "scalars").is_dir()]
+        for method, seeds in experiment.curves.items()
+    }
+    runs = {method: seeds for method, seeds in runs.items() if seeds}
+    charts = [chart for method, seeds in runs.items() for chart in _likelihood(experiment.labels[method], seeds)]
+    return charts, [chart for key in HEALTH for chart in _health(experiment, runs, key, colours)]
 
 
 def _likelihood(label: str, seeds: Sequence[Mapping[str, Curve]]) -> list[Chart]:

@@ -40,7 +40,7 @@ def test_the_picture_is_of_the_experiment_that_is_named(runs: Path, tmp_path: Pa
         assert sum(len(set(line.get_xdata())) == 2 for line in drawn[-1].axes[0].lines) == bars
     with pytest.raises(ValueError, match=r"runs has no experiment 'mine'; it has methods, scaling, short, steps\."):
         report(mine, tmp_path / "d.png", "mine")
-    with pytest.raises(ValueError, match=r"--experiment=short is for a picture.png; tables.md shows all experiments"):
+    with pytest.raises(ValueError, match=r"--experiment=short is for a picture.png; tables.md shows all of them"):
         report(mine, tmp_path / "tables.md", "short")
 
 
