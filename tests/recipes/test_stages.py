@@ -371,6 +371,23 @@ def test_rollouts_of_an_expert_stand_against_those_of_the_reference(runs: Path, 
             assert sorted(side.flatten(1).tolist()) == sorted(every), "all four of each, drawn without repetition"
 
 
+def test_the_log_stands_against_rollouts_that_nothing_ranked(runs: Path, options: Callable) -> None:
+    store = PreferenceStore(runs / "preferences")
+    tokenizer, drawn = open_policy(runs / "reference/policy.pt")[0].tokenizer, []
+    for row, group in enumerate(pairs_of(runs, options, kind="adversarial", num=3)):
+        context = group.context
+        log = tokenizer.encode_tracks(context.logged, context.logged_valid, context.recent, context.kind)
+        assert all(torch.equal(each, log.tokens) for each in group.preferred) and len(group.preferred) == 3
+        held = store.read([row], num_agents=len(context.kind))[0]
+        assert torch.equal(group.token_valid, held[keys.TOKEN_VALID] & log.valid & context.controlled[:, None])
+        ranks = ranks_of(runs, row, group.unpreferred)
+        assert len(set(ranks)) == 3, "rollouts of the scene, each once"
+        drawn.append(tuple(sorted(ranks)))
+        moved = (log.poses - context.logged)[..., :2].norm(dim=-1)[log.valid.repeat_interleave(tokenizer.steps, -1)]
+        assert moved.mean() < 0.5, "tokens of the log drive the log"
+    assert len(set(drawn)) > 1, "not always the same ranks"
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
