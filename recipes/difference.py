@@ -10,21 +10,18 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rich.console import Console
 from rich.table import Table
 
 from dpa.report.experiment import Decoding, Experiment, decoding_of, in_words, read_experiment
-from dpa.report.paired import paired_values
+from dpa.report.paired import Rows, paired_values
 from dpa.report.statistics import Interval, paired_bootstrap
 from dpa.report.study import Evaluations
 from recipes.common.cli import refused
-
-Rows = Sequence[Mapping[str, Any]]
-"""Rows of one method at one decoding, one for each seed."""
 
 
 class Difference(NamedTuple):

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dpa.report.experiment import Comparison, Decoding, Experiment
+from dpa.report.paired import Rows, scene_values
 from dpa.report.statistics import Interval, interval_of, resampled_means
 from dpa.report.study import Evaluations
 from dpa.report.table import REFERENCE
-
-Rows = Sequence[Mapping[str, Any]]
-"""Rows of a method at one decoding, one for each seed, with their ``file``."""
 
 
 def matched(experiment: Experiment, method: str, decoding: Decoding, evaluations: Evaluations) -> Interval | None:
@@ -63,7 +60,7 @@ def matched_difference(
     """
     if len(base) < 2:
         return None
-    values = _values([mine, *base], evaluations)
+    values = scene_values([mine, *base], ["realism", "spread"], evaluations)
     if values is None:
         return None
     realism, spread = values.mean((-1, -2)).reshape(2, -1, 1)
@@ -72,21 +69,6 @@ def matched_difference(
     _, _, num_seeds, num_scenes = values.shape
     drawn = resampled_means(values.reshape(-1, num_seeds, num_scenes), num_resamples).reshape(2, -1, num_resamples)
     return interval_of(float(_above(realism, spread)[0]), _above(*drawn), num_seeds, num_scenes)
-
-
-def _values(groups: Sequence[Rows], evaluations: Evaluations) -> NDArray | None:
-    """Realism and spread, ``[2, groups, seeds, scenes]``, of the scenes where all have both."""
-    seeds = [row["seed"] for row in groups[0]]
-    by_seed = [{row["seed"]: evaluations(row["file"]) for row in rows} for rows in groups]
-    found = [[each.get(seed) for seed in seeds] for each in by_seed]
-    if not seeds or any(scenes is None or "spread" not in scenes for runs in found for scenes in runs):
-        return None
-    if len({len(scenes["realism"]) for runs in found for scenes in runs}) != 1:
-        return None
-    values = [[[scenes[key] for scenes in runs] for runs in found] for key in ("realism", "spread")]
-    both = np.array(values, dtype=float)
-    both = both[..., ~np.isnan(both).any((0, 1, 2))]
-    return both if both.shape[-1] else None
 
 
 def _above(realism: NDArray, spread: NDArray) -> NDArray:

@@ -12,42 +12,44 @@ from dpa.report.markup import Html, quiet
 from dpa.report.statistics import Interval, paired_bootstrap
 from dpa.report.study import Evaluations
 
+Rows = Sequence[Mapping[str, Any]]
+"""Rows of a method at one decoding, one for each seed, with their ``file``."""
 
-def paired_values(
-    mine: Sequence[Mapping[str, Any]], base: Sequence[Mapping[str, Any]], key: str, evaluations: Evaluations
-) -> NDArray | None:
-    """A figure of two methods, paired by seed and scene.
+
+def scene_values(groups: Sequence[Rows], figures: Sequence[str], evaluations: Evaluations) -> NDArray | None:
+    """Figures of several methods or decodings, paired by seed and scene.
 
     Args:
-        mine: rows of a method, one for each seed, with their ``file``.
-        base: rows of the other.
-        key: of the figure.
+        groups: rows of each; the seeds are those of the first.
+        figures: keys of what is asked for.
         evaluations: figures of every scene.
 
     Returns:
-        ``[2, seeds, scenes]`` over the scenes where all rows have a value; None where a file or the figure is missing,
-        the seeds are others, or no scene is left.
+        ``[figures, groups, seeds, scenes]`` over the scenes where all rows have all values; None where a file, a seed
+        or a figure is missing, numbers of scenes differ, or no scene is left.
     """
-    by_seed = {row["seed"]: row for row in base}
-    if not mine or any(row["seed"] not in by_seed for row in mine):
+    seeds = [row["seed"] for row in groups[0]]
+    files = [{row["seed"]: row["file"] for row in rows} for rows in groups]
+    if not seeds or any(seed not in each for each in files for seed in seeds):
         return None
-    values = []
-    for rows in (mine, [by_seed[row["seed"]] for row in mine]):
-        found = [evaluations(row["file"]) for row in rows]
-        if any(scenes is None or key not in scenes for scenes in found):
-            return None
-        values.append([scenes[key] for scenes in found])
-    if len({len(scenes) for side in values for scenes in side}) != 1:
+    found = [[evaluations(each[seed]) for seed in seeds] for each in files]
+    if any(scenes is None or key not in scenes for runs in found for scenes in runs for key in figures):
         return None
-    both = np.array(values, dtype=float)
-    both = both[:, :, ~np.isnan(both).any((0, 1))]
-    return both if both.shape[-1] else None
+    if len({len(scenes[key]) for runs in found for scenes in runs for key in figures}) != 1:
+        return None
+    values = np.array([[[scenes[key] for scenes in runs] for runs in found] for key in figures], dtype=float)
+    values = values[..., ~np.isnan(values).any((0, 1, 2))]
+    return values if values.shape[-1] else None
 
 
-def paired_figure(
-    mine: Sequence[Mapping[str, Any]], base: Sequence[Mapping[str, Any]], key: str, evaluations: Evaluations
-) -> Interval | None:
-    """A figure minus that of another method; arguments, and when it is None, as in :func:`paired_values`."""
+def paired_values(mine: Rows, base: Rows, key: str, evaluations: Evaluations) -> NDArray | None:
+    """A figure of two methods, ``[2, seeds, scenes]``; None as in :func:`scene_values`."""
+    values = scene_values([mine, base], [key], evaluations)
+    return None if values is None else values[0]
+
+
+def paired_figure(mine: Rows, base: Rows, key: str, evaluations: Evaluations) -> Interval | None:
+    """A figure minus that of another method, with its interval; None as in :func:`scene_values`."""
     both = paired_values(mine, base, key, evaluations)
     return None if both is None else paired_bootstrap(both[0], both[1])
 
