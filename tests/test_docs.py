@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import pytest
 from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from dpa.ranking import AGGREGATES, FEATURES, SOLVERS
 from dpa.report.likelihoods import who_learns
@@ -286,20 +286,27 @@ def test_the_tables_of_the_results_are_those_of_the_studies_beside_them(study: S
         assert not [row for table in tables if table is not None for row in table.splitlines() if row not in told]
 
 
-def options_told(experiment: str) -> list[str]:
-    """What the page of results says after ``--config-name study`` where it runs the experiment."""
+COMMANDS = {
+    "sumo": ("study", r"--config-name study (experiment={experiment}(?: .*)?)"),
+    "gpudrive": ("compare", r"(experiment={experiment} scenes=gpudrive .*)"),
+}
+"""Configuration and arguments of ``recipes.compare`` by which the page of results runs an experiment on a source."""
+
+
+def options_told(source: str, experiment: str) -> DictConfig:
+    """The configuration of the command by which the page of results runs an experiment."""
     told = (REPOSITORY / "docs" / "results.md").read_text(encoding="utf-8")
-    (options,) = re.findall(
-        rf"^ +python -m recipes.compare --config-name study (experiment={experiment}(?: .*)?)$", told, re.M
-    )
-    return shlex.split(options)
+    config, pattern = COMMANDS[source]
+    pattern = pattern.format(experiment=experiment)
+    (options,) = re.findall(rf"^ +python -m recipes.compare {pattern}$", told, re.MULTILINE)
+    with initialize_config_dir(str(CONFIG), version_base="1.3"):
+        return compose(config, shlex.split(options))
 
 
 def test_the_study_beside_the_results_has_the_options_that_its_command_gives(study: Study) -> None:
     """Of all that decides a result; where scenes are kept, and what was shown, may differ."""
     for experiment in study.experiments.values():
-        with initialize_config_dir(str(CONFIG), version_base="1.3"):
-            given = OmegaConf.to_container(compose("study", options_told(experiment.name)), resolve=True)
+        given = OmegaConf.to_container(options_told(experiment.scenes["source"], experiment.name), resolve=True)
         made = json.loads((study.folder / "experiments" / f"{experiment.name}.json").read_text())["config"]
         for name in ("seeds", "model", "pretraining", "collection", "alignment", "evaluation", "decoding", "rankings"):
             assert made[name] == given[name], name
@@ -325,7 +332,15 @@ def leaves(value: Any, path: str = "") -> dict[str, Any]:
     return {place: leaf for key, each in inside for place, leaf in leaves(each, f"{path}/{key}").items()}
 
 
-@pytest.mark.parametrize("name", ["validity", "discriminator"])
+RANKINGS = [
+    pytest.param(path, name, id=f"{path.stem}-{name}")
+    for path in STUDIES
+    for name in ("validity", "discriminator")
+    if f"{name}/summary.json" in zipfile.ZipFile(path).namelist()
+]
+
+
+@pytest.mark.parametrize(("study", "name"), RANKINGS, indirect=["study"])
 def test_the_tables_of_a_study_of_rankings_are_those_of_the_values_of_its_scenes(study: Study, name: str) -> None:
     told = (REPOSITORY / "docs" / "results.md").read_text(encoding="utf-8")
     summary, folder = study.summaries[name], study.folder / name
