@@ -286,7 +286,7 @@ def test_the_tables_of_the_results_are_those_of_the_studies_beside_them(study: S
         assert not [row for table in tables if table is not None for row in table.splitlines() if row not in told]
 
 
-COMMANDS = {
+STUDIED_BY = {
     "sumo": ("study", r"--config-name study (experiment={experiment}(?: .*)?)"),
     "gpudrive": ("compare", r"(experiment={experiment} scenes=gpudrive .*)"),
 }
@@ -296,7 +296,7 @@ COMMANDS = {
 def options_told(source: str, experiment: str) -> DictConfig:
     """The configuration of the command by which the page of results runs an experiment."""
     told = (REPOSITORY / "docs" / "results.md").read_text(encoding="utf-8")
-    config, pattern = COMMANDS[source]
+    config, pattern = STUDIED_BY[source]
     pattern = pattern.format(experiment=experiment)
     (options,) = re.findall(rf"^ +python -m recipes.compare {pattern}$", told, re.MULTILINE)
     with initialize_config_dir(str(CONFIG), version_base="1.3"):
