@@ -12,10 +12,10 @@ from random import Random
 from envs.sources.gpudrive import MAX_BYTES
 from tests.envs.made import newer_gpudrive, older_gpudrive
 from tests.fuzz.case import Files, Format, load_file, on_first, read_source
-from tests.fuzz.edits import edit_bytes
+from tests.fuzz.edits import edit_bytes, pack
 from tests.fuzz.trees import edit_json
 
-PACK = {".json": bytes, ".gz": lambda data: gzip.compress(data, 1), ".xz": lambda data: lzma.compress(data, preset=0)}
+PACK = {".json": bytes, ".gz": pack, ".xz": lambda data: lzma.compress(data, preset=0)}
 UNPACK = {".json": bytes, ".gz": gzip.decompress, ".xz": lzma.decompress}
 SMALL = ("[]", "[[]]", "{}", '{"x":0}', "0", '""', "[[[]]]", "null")
 HUGE = (2**20, 2**23, MAX_BYTES - 2**12, MAX_BYTES + 1)

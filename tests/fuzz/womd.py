@@ -9,7 +9,7 @@ from random import Random
 from envs.sources.tfrecord import MAX_PAYLOAD, frame, masked_crc
 from tests.envs.made import make_rich_scenario, make_scenario
 from tests.fuzz.case import Files, Format, load_file, on_first, read_source
-from tests.fuzz.edits import edit_bytes
+from tests.fuzz.edits import edit_bytes, pack
 from tests.fuzz.wire import DEEP, END, LENGTH, START, VARINT, edit_message, field, varint
 
 LENGTHS = (0, 1, 2**28, 2**28 + 1, 2**31, 2**32, 2**63 - 1, 2**63, 2**64 - 1)
@@ -23,9 +23,9 @@ def seeds() -> list[Files]:
     return [
         {"plain.tfrecord": frames},
         {"one.tfrecord": frame(rich)},
-        {"packed.tfrecord.gz": gzip.compress(frames)},
+        {"packed.tfrecord.gz": pack(frames)},
         {"bare.pb": rich},
-        {"packed.pb.gz": gzip.compress(rich, 1)},
+        {"packed.pb.gz": pack(rich)},
     ]
 
 
@@ -51,7 +51,7 @@ def _payloads(files: Files) -> tuple[list[bytes], bool, bool]:
 
 
 def _file(files: Files, content: bytes, packed: bool) -> Files:
-    return {next(iter(files)): gzip.compress(content, 1) if packed else content}
+    return {next(iter(files)): pack(content) if packed else content}
 
 
 def edit_payload(files: Files, r: Random, edit=edit_message) -> Files:
