@@ -388,6 +388,7 @@ def test_fifty_kills_at_random_moments_leave_the_bytes_of_an_undisturbed_convers
     assert len(SceneStore(tmp_path / "cut0")) == 60
 
 
+@pytest.mark.slow
 def test_two_workers_give_the_same_bytes_as_one(raw: Path, tmp_path: Path) -> None:
     convert("womd", [raw], tmp_path / "one", shard_size=2)
     convert("womd", [raw], tmp_path / "two", shard_size=2, workers=2)

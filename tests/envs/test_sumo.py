@@ -259,6 +259,7 @@ def same(one: Scene, other: Scene) -> bool:
     return one.scene_id == other.scene_id and not parts
 
 
+@pytest.mark.slow
 def test_a_unit_gives_the_same_scenes_in_any_process() -> None:
     unit = sumo.units(2, seed=4, preset="town", windows=1, warmup=5.0)[0]
     with multiprocessing.get_context("spawn").Pool(1) as pool:

@@ -31,6 +31,7 @@ def test_a_crowded_scene_has_the_agents_and_edges_that_were_asked_for() -> None:
     assert noisy_log(scene, 2).shape == (2, 128, 80, 4)
 
 
+@pytest.mark.slow
 def test_the_metric_is_timed_on_files_of_ones_own(
     stores: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -40,7 +40,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def files(made: Path) -> tuple[Path, dict[str, Any]]:
-    """Logs as files, which no test changes, and the experiment."""
+    """Logs as files and the experiment; tests may write the same again, and nothing else."""
     return logged(made, "csv")
 
 
@@ -177,10 +177,10 @@ def test_only_pictures_that_were_drawn_of_the_experiment_are_logged(
     assert (folder / "pictures/scenes/likely/0.png").read_bytes() == likely.read_bytes()
 
 
-def test_logs_are_written_anew_when_an_experiment_is_run_again(study: Path) -> None:
-    folder, _ = logged(study, "csv")
+def test_logs_are_written_anew_when_an_experiment_is_run_again(made: Path, files: tuple[Path, dict[str, Any]]) -> None:
+    folder, _ = files
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.suffix == ".csv"}
-    logged(study, "csv")
+    assert before and logged(made, "csv")[0] == folder
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.suffix == ".csv"} == before
 
 

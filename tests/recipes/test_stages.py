@@ -1066,6 +1066,7 @@ def test_workers_that_are_told_to_stop_begin_no_job(tmp_path: Path) -> None:
     assert len(list(made.iterdir())) <= 1
 
 
+@pytest.mark.slow
 def test_workers_share_the_gpus_that_the_command_may_use(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
     seen = []

@@ -107,6 +107,7 @@ def test_of_two_open_writers_the_first_to_store_a_scene_wins(tmp_path: Path) -> 
     assert len(list(tmp_path.glob("chunk-*"))) == 2
 
 
+@pytest.mark.slow
 def test_four_processes_that_append_overlapping_scenes_store_each_once(tmp_path: Path) -> None:
     ranges = (range(30), range(10, 40), range(20, 48), range(47, -1, -1))
     writers = [Appending(tmp_path, scenes, chunk) for chunk, scenes in enumerate(ranges, start=1)]

@@ -168,6 +168,7 @@ def fail(scenes: object) -> Callable[[TensorDictBase], TensorDictBase]:
     return process
 
 
+@pytest.mark.slow
 def test_processes_give_the_same_rollouts_in_the_same_order_although_one_is_killed(
     model: MotionLM, scenes: list[Scene], tmp_path: Path
 ) -> None:
