@@ -28,7 +28,8 @@ def provenance(recipe: str, device: str) -> dict[str, Any]:
         >>> sorted(provenance("compare", "cpu"))
         ['command', 'date', 'machine', 'revision', 'versions']
     """
-    machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPU cores"
+    vectors = torch.backends.cpu.get_cpu_capability()  # on these depends how a CPU rounds
+    machine = f"{platform.system()} {platform.machine()} ({vectors}), {os.cpu_count()} CPU cores"
     if torch.device(device).type == "cuda":
         machine += f", {torch.cuda.get_device_name(device)}"
     return {
