@@ -19,7 +19,8 @@ from dpa.ranking import AGGREGATES, FEATURES, SOLVERS
 from dpa.report.likelihoods import who_learns
 from dpa.report.statistics import paired_bootstrap
 from dpa.report.study import FIRST, Evaluations, Study, read_study
-from dpa.report.text import comparison_table, learnt_table, likelihood_table, sharpness_table
+from dpa.report.table import difference, number
+from dpa.report.text import comparison_table, learnt_table, likelihood_table, safety_table, sharpness_table
 from envs import keys
 from envs.convert.__main__ import make_parser as convert_parser
 from envs.sources import SOURCES
@@ -93,9 +94,9 @@ def registries():
 def test_the_python_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     namespace = {"__name__": "documentation"}
-    for number, block in enumerate(blocks(page)):
+    for place, block in enumerate(blocks(page)):
         if block.language == "python":
-            code = compile(block.code, f"{page.name}[{number}]", "exec", dont_inherit=True)
+            code = compile(block.code, f"{page.name}[{place}]", "exec", dont_inherit=True)
             if block.runs:
                 exec(code, namespace)
 
@@ -259,6 +260,10 @@ def test_pictures_of_the_documents_are_small() -> None:
 
 
 SPLITS = ("train", "tune", "eval")
+WITH_SAFETY = {FIRST, "variants", "losses", "rounds"}
+"""Experiments whose table of safety the page of results has."""
+SHOWN = ("kinematic", "interactive", "map_based", "realism", "collision_rate", "offroad_rate")
+"""Measures in README's table."""
 STUDIES = sorted((REPOSITORY / "docs" / "studies").glob("*.zip"))
 
 
@@ -271,36 +276,52 @@ def study(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 def test_the_tables_of_the_results_are_those_of_the_studies_beside_them(study: Study) -> None:
     told = (REPOSITORY / "docs" / "results.md").read_text(encoding="utf-8")
+    evaluations = Evaluations(study.folder)
     for experiment in study.experiments.values():
         one = set(experiment.chosen.values()) == {experiment.common}  # decoding: both tables would say the same
-        for comparison in [experiment.own_best] if one else [experiment.own_best, experiment.at_common]:
-            rows = comparison_table(experiment, comparison).splitlines()
-            assert not [row for row in rows if row not in told]
-        evaluations = Evaluations(study.folder)
         learnt = who_learns(experiment, evaluations) if experiment.name == FIRST else None
         tables = [
+            comparison_table(experiment, experiment.own_best),
+            None if one else comparison_table(experiment, experiment.at_common),
+            safety_table(experiment, experiment.own_best, evaluations) if experiment.name in WITH_SAFETY else None,
             sharpness_table(experiment, evaluations),
-            likelihood_table(experiment, evaluations),
+            likelihood_table(experiment, evaluations) if experiment.likelihood else None,
             None if learnt is None else learnt_table(learnt),
         ]
-        assert not [row for table in tables if table is not None for row in table.splitlines() if row not in told]
+        assert not [table for table in tables if table is not None and table.rstrip() not in told], experiment.name
+
+
+@pytest.mark.parametrize("study", [path for path in STUDIES if path.stem == "sumo"], indirect=True)
+def test_the_table_of_the_readme_is_that_of_the_study_beside_the_results(study: Study) -> None:
+    text = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+    rows = [[cell.strip(" *") for cell in line.strip("|").split("|")] for line in text.splitlines() if "|" in line]
+    told = {cells[0]: cells[1:8] for cells in rows if len(cells) == 9}
+    shown = dict.fromkeys(study.experiments["methods"].methods, "methods") | {"normalised_more_pairs": "variants"}
+    for method, name in shown.items():
+        experiment = study.experiments[name]
+        of = next(record for record in experiment.own_best.records() if record["method"] == method)
+        entry = experiment.own_best.entry(method)
+        change = "–" if entry is None else difference(entry["realism_difference"], entry["ci95"])
+        label = "a variant: two changes" if name == "variants" else experiment.labels[method]
+        assert told[label] == [*(number(of[key], 3) for key in SHOWN), change], label
 
 
 STUDIED_BY = {
-    "sumo": ("study", r"--config-name study (experiment={experiment}(?: .*)?)"),
-    "gpudrive": ("compare", r"(experiment={experiment} scenes=gpudrive .*)"),
+    "sumo": ("study", r"--config-name study (experiment=.*)"),
+    "gpudrive": ("compare", r"(experiment=\w+ scenes=gpudrive .*)"),
 }
-"""Configuration and arguments of ``recipes.compare`` by which the page of results runs an experiment on a source."""
+"""Configuration and arguments of ``recipes.compare`` by which the page of results runs experiments on a source."""
 
 
 def options_told(source: str, experiment: str) -> DictConfig:
     """The configuration of the command by which the page of results runs an experiment."""
     told = (REPOSITORY / "docs" / "results.md").read_text(encoding="utf-8")
     config, pattern = STUDIED_BY[source]
-    pattern = pattern.format(experiment=experiment)
-    (options,) = re.findall(rf"^ +python -m recipes.compare {pattern}$", told, re.MULTILINE)
+    commands = re.findall(rf"^ +python -m recipes.compare {pattern}$", told, re.MULTILINE)
     with initialize_config_dir(str(CONFIG), version_base="1.3"):
-        return compose(config, shlex.split(options))
+        composed = [compose(config, shlex.split(options)) for options in commands]
+    (found,) = [each for each in composed if each.experiment.name == experiment]
+    return found
 
 
 def test_the_study_beside_the_results_has_the_options_that_its_command_gives(study: Study) -> None:

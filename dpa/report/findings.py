@@ -149,11 +149,13 @@ def saturated(experiment: Experiment, folder: Path) -> str | None:
 
 
 def _has_saturated(run: Path) -> bool:
-    """Whether the loss of a finished run saturated, by its options and its curves."""
-    watch, curves = SaturationWatch(read_json(run / "result.json")["options"]["loss"]), read_curves(run)
-    if any(f"train/{name}" not in curves for name in WATCHED):  # it imitates
-        return False
-    seen = [curves[f"train/{name}"] for name in WATCHED]
+    """Whether the loss of a finished run saturated: by its curves, and where it lacks them by the warning in its result."""
+    result = read_json(run / "result.json")
+    loss = result.get("options", {}).get("loss")
+    curves = read_curves(run) if (run / "scalars").is_dir() else {}
+    if loss is None or any(f"train/{name}" not in curves for name in WATCHED):
+        return "saturated" in result
+    watch, seen = SaturationWatch(loss), [curves[f"train/{name}"] for name in WATCHED]
     for done, *figures in zip(seen[0]["step"], *(curve["value"] for curve in seen), strict=True):
         watch(int(done) - 1, dict(zip(WATCHED, figures, strict=True)))
     return watch.found is not None

@@ -2,41 +2,92 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dpa.report.experiment import Comparison, Decoding, Experiment
+from dpa.report.experiment import Comparison, Decoding, Experiment, in_words
 from dpa.report.paired import Rows, scene_values
 from dpa.report.statistics import Interval, interval_of, resampled_means
 from dpa.report.study import Evaluations
-from dpa.report.table import REFERENCE
+from dpa.report.table import DIFFERENCE_TITLE, MISSING, REFERENCE, difference, number, signed
+
+SHARPNESS = ("method", "decoding", "spread [m]", "beyond [m]", DIFFERENCE_TITLE)
+"""Titles of :func:`sharpness_rows`."""
+ABOUT_SHARPNESS = (
+    "realism minus that of the reference where its rollouts lie as far apart, read between two of its decodings; where "
+    "none of them is as sharp (or as wide), minus that at the nearest, and the method's rollouts lie closer to each "
+    "other (further apart) by what stands under beyond"
+)
 
 
-def matched(experiment: Experiment, method: str, decoding: Decoding, evaluations: Evaluations) -> Interval | None:
-    """:func:`matched_difference` of a method on the tuning scenes, where all decodings of the grid were tried.
+class Matched(NamedTuple):
+    """A method beside its reference at the same sharpness, or at the nearest that the reference was sampled with.
+
+    Attributes:
+        change: of realism, method minus reference.
+        spread: mean distance between the method's rollouts of a scene [m].
+        beyond: by how much they lie further apart than those of every decoding of the reference [m]; below 0 where they
+            lie closer to each other, 0 where the reference is read at the same spread.
+    """
+
+    change: Interval
+    spread: float
+    beyond: float
+
+
+def equal_sharpness(experiment: Experiment, evaluations: Evaluations) -> Iterator[tuple[str, Decoding, Matched]]:
+    """Every method at its own best decoding and at the common one, on the scenes that the experiment reports.
+
+    The reference's decodings were all evaluated there, and nothing was chosen there.
 
     Args:
-        experiment: that tried them.
-        method: other than the reference.
-        decoding: of the method.
+        experiment: to show; one that tried a single decoding gives nothing.
         evaluations: figures of every scene.
     """
-    tuned = Comparison(experiment.tuning, [])
-    base = [rows for each in experiment.grid() if (rows := tuned.of(REFERENCE, each))]
-    return matched_difference(tuned.of(method, decoding), base, evaluations)
+    compared = (experiment.own_best, experiment.at_common)
+    base = reference_line(compared, experiment)
+    for method in experiment.methods:
+        for decoding in dict.fromkeys((experiment.chosen[method], experiment.common)) if method != REFERENCE else ():
+            mine = _rows(compared, method, decoding)
+            if mine and (found := matched_difference(mine, base, evaluations)):
+                yield method, decoding, found
+
+
+def sharpness_rows(experiment: Experiment, evaluations: Evaluations) -> list[list[str]]:
+    """:func:`equal_sharpness` as cells of a table with the titles :data:`SHARPNESS`."""
+    return [
+        [
+            experiment.labels[method],
+            in_words(decoding),
+            number(found.spread, 2),
+            signed(found.beyond, 2) if found.beyond else MISSING,
+            difference(found.change.mean, (found.change.low, found.change.high)),
+        ]
+        for method, decoding, found in equal_sharpness(experiment, evaluations)
+    ]
+
+
+def reference_line(compared: Sequence[Comparison], experiment: Experiment) -> list[Rows]:
+    """Rows of the reference at every decoding of the grid that one of the comparisons has."""
+    return [rows for each in experiment.grid() if (rows := _rows(compared, REFERENCE, each))]
+
+
+def _rows(compared: Sequence[Comparison], method: str, decoding: Decoding) -> Rows:
+    return next((rows for each in compared if (rows := each.of(method, decoding))), [])
 
 
 def matched_difference(
     mine: Rows, base: Sequence[Rows], evaluations: Evaluations, num_resamples: int = 10_000
-) -> Interval | None:
+) -> Matched | None:
     """Realism of a method at one decoding minus the reference's at the same spread of rollouts.
 
     The reference at several decodings is a line, realism over the mean distance between the rollouts of a scene, and is
-    read between two of its points. A method that only samples more sharply lies on that line. Each resample draws
-    seeds and scenes as in :func:`~dpa.report.statistics.paired_bootstrap` and makes line and point anew, where a point
-    beyond the line's end is compared with that end.
+    read between two of its points; beyond both of its ends, at the end. A method that only samples more sharply lies on
+    that line. Each resample draws seeds and scenes as in :func:`~dpa.report.statistics.paired_bootstrap` and makes line
+    and point anew.
 
     Args:
         mine: of the method.
@@ -45,8 +96,7 @@ def matched_difference(
         num_resamples: bootstrap draws.
 
     Returns:
-        None where the line has fewer than two points, the point lies beyond both of its ends, or a file or figure is
-        missing.
+        None where the line has fewer than two points, or as in :func:`~dpa.report.paired.scene_values`.
 
     Examples:
         >>> scenes = {
@@ -55,20 +105,21 @@ def matched_difference(
         ...     "mine": {"realism": [0.7, 0.7], "spread": [2.0, 2.0]},
         ... }
         >>> sharp, wide, mine = ([{"seed": 0, "file": name}] for name in ("sharp", "wide", "mine"))
-        >>> round(matched_difference(mine, [sharp, wide], scenes.get).mean, 3)
-        0.15
+        >>> found = matched_difference(mine, [sharp, wide], scenes.get)
+        >>> round(found.change.mean, 3), found.spread, found.beyond
+        (0.15, 2.0, 0.0)
     """
     if len(base) < 2:
         return None
     values = scene_values([mine, *base], ["realism", "spread"], evaluations)
     if values is None:
         return None
-    realism, spread = values.mean((-1, -2)).reshape(2, -1, 1)
-    if not spread[1:].min() <= spread[0] <= spread[1:].max():
-        return None
     _, _, num_seeds, num_scenes = values.shape
+    realism, spread = values.mean((-1, -2))
     drawn = resampled_means(values.reshape(-1, num_seeds, num_scenes), num_resamples).reshape(2, -1, num_resamples)
-    return interval_of(float(_above(realism, spread)[0]), _above(*drawn), num_seeds, num_scenes)
+    above = float(_above(realism[:, None], spread[:, None])[0])
+    beyond = spread[0] - spread[0].clip(spread[1:].min(), spread[1:].max())
+    return Matched(interval_of(above, _above(*drawn), num_seeds, num_scenes), float(spread[0]), float(beyond))
 
 
 def _above(realism: NDArray, spread: NDArray) -> NDArray:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
-from dpa.report.experiment import Comparison, Experiment, decoding_of, in_words
+from dpa.report.experiment import Comparison, Experiment, decoding_of
 from dpa.report.findings import budgets, chosen_on_the_same, headline, left_out, ordering, saturated
 from dpa.report.likelihoods import ABOUT_LEARNT, LEARNT, Learnt, likelihoods, shown_figures, who_learns
-from dpa.report.matched import matched
+from dpa.report.matched import ABOUT_SHARPNESS, SHARPNESS, sharpness_rows
 from dpa.report.paired import paired_figure
 from dpa.report.sections.safety import groups_of
 from dpa.report.statistics import Interval
@@ -16,7 +16,6 @@ from dpa.report.study import Evaluations, Study
 from dpa.report.table import (
     COLUMNS,
     MISSING,
-    REFERENCE,
     cells,
     difference,
     duration,
@@ -71,16 +70,16 @@ def _experiment(experiment: Experiment, evaluations: Evaluations) -> Iterator[st
         yield "**All at the common decoding**, and the reference at the others:"
         yield comparison_table(experiment, experiment.at_common)
     if told := sharpness_table(experiment, evaluations):
-        yield (
-            "**At equal sharpness**, on the tuning scenes: realism minus that of the reference where its rollouts lie "
-            "as far apart, between two of its decodings; a dash where none of them does:"
-        )
+        yield f"**At equal sharpness** of sampling: {ABOUT_SHARPNESS}:"
         yield told
     if experiment.likelihood:
         if learnt := who_learns(experiment, evaluations):
             yield f"**Who learns the ranking** (table 3); {ABOUT_LEARNT}:"
             yield learnt_table(learnt)
-        yield "**Likelihood** of the reference's ranked rollouts, per token [nats]; KL along rollouts of the method:"
+        yield (
+            f"**Likelihood** of the reference's ranked rollouts of {experiment.reported}, per token [nats], in "
+            "parentheses the difference from the reference; KL along rollouts of the method:"
+        )
         yield likelihood_table(experiment, evaluations)
 
 
@@ -145,21 +144,17 @@ def _published(experiment: Experiment, titles: Sequence[str]) -> Iterator[list[s
 
 
 def sharpness_table(experiment: Experiment, evaluations: Evaluations) -> str | None:
-    """Realism of every method and decoding minus that of the reference where its rollouts lie as far apart.
+    """Realism of every method minus that of the reference where its rollouts lie as far apart.
 
     Args:
         experiment: that tried several decodings.
         evaluations: figures of every scene.
 
     Returns:
-        Markdown; None where no method has a decoding as sharp as one of the reference's.
+        Markdown; None where nothing can be compared.
     """
-    grid, rows = experiment.grid(), []
-    for method in experiment.methods:
-        found = [matched(experiment, method, decoding, evaluations) for decoding in grid]
-        if method != REFERENCE and any(found):
-            rows.append([experiment.labels[method], *map(_change, found)])
-    return to_markdown(["method", *map(in_words, grid)], rows) if rows else None
+    rows = sharpness_rows(experiment, evaluations)
+    return to_markdown(SHARPNESS, rows) if rows else None
 
 
 def likelihood_table(experiment: Experiment, evaluations: Evaluations) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from omegaconf import DictConfig
 from dpa.report.experiment import Comparison, Experiment
 from dpa.report.figures import plot_comparison
 from dpa.report.likelihoods import FIGURES
-from dpa.report.matched import matched
+from dpa.report.matched import equal_sharpness
 from dpa.report.scenes import read_scene_cards
 from dpa.report.sections.safety import MEASURES
 from dpa.report.stills import draw_charts, experiment_charts
@@ -77,8 +76,9 @@ def _tables(experiment: Experiment, runs: RunFolder) -> Iterator[tuple[str, Cell
     if experiment.likelihood:
         yield "likelihood/methods", _measured(summarise(experiment.likelihood), FIGURES)
     yield "tuning/decodings", _measured(summarise(experiment.tuning), TUNING)
-    if rows := list(_matched(experiment, Evaluations(runs.root))):
-        yield "tuning/equal_sharpness", (["method", *DECODING.values(), "Δ realism", "low", "high"], rows)
+    if rows := list(_equal_sharpness(experiment, Evaluations(runs.root))):
+        titles = ["method", *DECODING.values(), "spread [m]", "beyond [m]", "Δ realism", "low", "high"]
+        yield "equal_sharpness/methods", (titles, rows)
     if experiment.stages:
         rows = [[name, _short(seconds)] for name, seconds in experiment.stages.items()]
         yield "account/stages", (["stage", "seconds of one worker"], rows)
@@ -86,12 +86,9 @@ def _tables(experiment: Experiment, runs: RunFolder) -> Iterator[tuple[str, Cell
         yield f"scenes/{split}", (["of all scenes", split], list(card.facts.items()))
 
 
-def _matched(experiment: Experiment, evaluations: Evaluations) -> Iterator[list[Any]]:
-    """Realism above the reference's at equal sharpness, where the reference was as sharp."""
-    for method, (top_p, temperature) in product(experiment.methods, experiment.grid()):
-        found = matched(experiment, method, (top_p, temperature), evaluations)
-        if method != REFERENCE and found is not None:
-            yield [method, top_p, temperature, *map(_short, (found.mean, found.low, found.high))]
+def _equal_sharpness(experiment: Experiment, evaluations: Evaluations) -> Iterator[list[Any]]:
+    for method, decoding, (change, *place) in equal_sharpness(experiment, evaluations):
+        yield [method, *decoding, *map(_short, (*place, change.mean, change.low, change.high))]
 
 
 def _measured(records: Sequence[Mapping[str, Any]], figures: Mapping[str, str]) -> Cells:

@@ -14,7 +14,7 @@ from PIL import Image
 from tensorboard.backend.event_processing.plugin_event_accumulator import EventAccumulator
 
 from dpa.report.experiment import read_experiment
-from dpa.report.matched import matched
+from dpa.report.matched import equal_sharpness
 from dpa.report.scenes import read_scene_cards
 from dpa.report.study import Evaluations
 from dpa.report.table import number
@@ -25,7 +25,7 @@ from tests.dpa.training.offline import wandb_history
 
 TABLES = {
     "common/methods", "common/safety", "own_best/methods", "own_best/safety", "likelihood/methods", "tuning/decodings",
-    "tuning/equal_sharpness", "account/stages", "scenes/train", "scenes/tune", "scenes/eval",
+    "equal_sharpness/methods", "account/stages", "scenes/train", "scenes/tune", "scenes/eval",
 }  # fmt: skip
 OF_METHODS = {name for name in TABLES if name.partition("/")[0] not in ("account", "scenes")}
 PICTURES = {
@@ -128,17 +128,16 @@ def test_every_decoding_that_was_tried_has_a_row_with_realism_and_spread(files: 
             assert float(row[title]) == pytest.approx(sum(scenes) / len(scenes), rel=1e-4)
 
 
-def test_realism_at_equal_sharpness_is_a_table_of_what_the_page_draws(files: tuple[Path, dict[str, Any]]) -> None:
-    folder, _ = files
+def test_realism_at_equal_sharpness_is_the_table_of_the_page(files: tuple[Path, dict[str, Any]]) -> None:
+    folder, found = files
     experiment = read_experiment(folder.with_suffix(".json"))
-    rows = rows_of(folder, "tuning/equal_sharpness")
-    assert rows and "reference" not in {row["method"] for row in rows}
-    for row in rows:
-        decoding = float(row["top-p"]), float(row["temperature"])
-        found = matched(experiment, row["method"], decoding, Evaluations(folder.parents[1]))
-        assert found is not None
-        told = [float(row[title]) for title in ("Δ realism", "low", "high")]
-        assert told == pytest.approx([found.mean, found.low, found.high], rel=1e-4)
+    rows = rows_of(folder, "equal_sharpness/methods")
+    expected = list(equal_sharpness(experiment, Evaluations(folder.parents[1])))
+    assert {row["method"] for row in rows} == {*found["methods"]} - {"reference"}
+    for row, (method, decoding, (change, spread, beyond)) in zip(rows, expected, strict=True):
+        assert (row["method"], float(row["top-p"]), float(row["temperature"])) == (method, *decoding)
+        told = [float(row[title]) for title in ("spread [m]", "beyond [m]", "Δ realism", "low", "high")]
+        assert told == pytest.approx([spread, beyond, change.mean, change.low, change.high], rel=1e-4)
 
 
 def test_hours_and_data_cards_are_tables(files: tuple[Path, dict[str, Any]], study: Path) -> None:

@@ -24,7 +24,7 @@ from dpa.report.markup import (
     table,
     tabs,
 )
-from dpa.report.matched import matched
+from dpa.report.matched import ABOUT_SHARPNESS, SHARPNESS, matched_difference, reference_line, sharpness_rows
 from dpa.report.paired import paired_figure, quiet_change
 from dpa.report.sections.likelihood import likelihood_table
 from dpa.report.sections.origin import code_of
@@ -74,6 +74,7 @@ def experiment_section(experiment: Experiment, colours: Mapping[str, str], evalu
         tabs(panels, f"decoding-{experiment.name}"),
         *(element("p", note, class_="note") for note in notes),
         gallery([chart for chart in charts if chart is not None]),
+        sharpness_table(experiment, evaluations),
         likelihood_table(experiment, evaluations),
         folded("command, configuration, versions and machine", _made(experiment)),
     ]
@@ -118,7 +119,8 @@ def matched_curves(experiment: Experiment, colours: Mapping[str, str], evaluatio
         colours: of its methods.
         evaluations: figures of every scene, for the intervals.
     """
-    content = []
+    content, tuned = [], Comparison(experiment.tuning, [])
+    base = reference_line([tuned], experiment)
     for method in experiment.methods:
         records = Comparison([row for row in experiment.tuning if row["method"] == method], []).records()
         known = [r for r in records if r.get("spread") is not None and r["realism"] is not None]
@@ -126,10 +128,9 @@ def matched_curves(experiment: Experiment, colours: Mapping[str, str], evaluatio
         if not known:
             continue
         label, chosen = experiment.labels[method], experiment.chosen.get(method)
-        above = [
-            None if method == REFERENCE else matched(experiment, method, decoding_of(record), evaluations)
-            for record in known
-        ]
+        line = [] if method == REFERENCE else base
+        matched = [matched_difference(tuned.of(method, decoding_of(each)), line, evaluations) for each in known]
+        above = [each and each.change for each in matched]
         content.append(
             Line(
                 label,
@@ -156,19 +157,26 @@ def matched_curves(experiment: Experiment, colours: Mapping[str, str], evaluatio
     caption = (
         "Every decoding of the grid, mean over seeds; the large marker is the one chosen. Left is sharper sampling. A "
         "method that only samples more sharply lies on the line of the reference; bars are 95 % intervals of how far "
-        "above that line a point lies: one that does not reach it is told apart."
+        "above that line a point lies, beyond its ends above its end: one that does not reach it is told apart."
     )
     title = "Realism against sharpness of sampling, tuning scenes"
     return [curves(content, title, x="distance between the rollouts of a scene [m]", y="realism", caption=caption)]
 
 
+def sharpness_table(experiment: Experiment, evaluations: Evaluations) -> Html:
+    """Methods at equal sharpness; nothing where the reference was sampled at one decoding."""
+    rows = sharpness_rows(experiment, evaluations)
+    if not rows:
+        return Html("")
+    about = hint(f"On {experiment.reported}: {ABOUT_SHARPNESS}.")
+    return joined([element("h3", "At equal sharpness of sampling"), table(SHARPNESS, rows), about])
+
+
 def _reach(above: Sequence[Interval | None]) -> tuple[list[float], list[float]] | None:
-    """How far bars reach up and down from points above or below a line; none where nothing is compared."""
-    if not any(above):
+    """How far bars reach up and down from points above or below a line; None where a point is compared with nothing."""
+    if not all(above):
         return None
-    found = [(0.0, 0.0) if each is None else (each.high - each.mean, each.mean - each.low) for each in above]
-    up, down = zip(*found, strict=True)
-    return list(up), list(down)
+    return [each.high - each.mean for each in above], [each.mean - each.low for each in above]
 
 
 def _panel(experiment: Experiment, comparison: Comparison, evaluations: Evaluations) -> Html:

@@ -1,4 +1,4 @@
-"""A method above the reference at equal sharpness: on its line by nothing, above it by what was added, and no guess."""
+"""A method above the reference at equal sharpness: on its line by nothing, above it by what was added."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from dpa.report.matched import _above, matched_difference
+from dpa.report.statistics import paired_bootstrap
 
 SEEDS, SCENES = 3, 8
 
@@ -55,9 +56,11 @@ def test_a_method_between_two_decodings_is_above_the_line_by_what_was_added_to_i
     mine = made.rows("mine", (sharp[0] + wide[0]) / 2 + lift, (sharp[1] + wide[1]) / 2)
     for groups in (base, base[::-1]):
         found = matched_difference(mine, groups, made, num_resamples=200)
-        assert found is not None
-        assert (found.mean, found.low, found.high) == pytest.approx((lift, lift, lift), abs=1e-12)
-        assert (found.num_seeds, found.num_scenes) == (SEEDS, SCENES)
+        assert found is not None and found.beyond == 0
+        assert found.spread == pytest.approx((sharp[1] + wide[1]).mean() / 2)
+        change = found.change
+        assert (change.mean, change.low, change.high) == pytest.approx((lift, lift, lift), abs=1e-12)
+        assert (change.num_seeds, change.num_scenes) == (SEEDS, SCENES)
 
 
 def test_a_method_that_only_samples_more_sharply_is_not_told_apart(draw: np.random.Generator) -> None:
@@ -66,14 +69,20 @@ def test_a_method_that_only_samples_more_sharply_is_not_told_apart(draw: np.rand
     base, (sharp, wide) = line(made, draw)
     mine = made.rows("mine", 0.8 * sharp[0] + 0.2 * wide[0] + draw.normal(0, 0.01, (SEEDS, SCENES)), 0 * wide[1] + 1.4)
     found = matched_difference(mine, base, made)
-    assert found is not None and not found.excludes_zero and abs(found.mean) < 0.01
+    assert found is not None and not found.change.excludes_zero and abs(found.change.mean) < 0.01
 
 
-def test_beyond_both_ends_of_the_line_nothing_is_guessed(draw: np.random.Generator) -> None:
+def test_beyond_both_ends_of_the_line_the_end_is_compared_with_and_its_distance_told(draw: np.random.Generator) -> None:
+    """The difference is then that of two decodings, paired by seed and scene."""
     made = Made()
     base, (sharp, wide) = line(made, draw)
-    for name, spread in (("sharper", sharp[1] - 0.5), ("wider", wide[1] + 0.5)):
-        assert matched_difference(made.rows(name, sharp[0], spread), base, made) is None
+    for name, (realism, spread), beyond in (("sharper", sharp, -0.5), ("wider", wide, 0.5)):
+        mine = realism + draw.normal(0.02, 0.01, realism.shape)
+        found = matched_difference(made.rows(name, mine, spread + beyond), base, made)
+        assert found is not None and found.beyond == pytest.approx(beyond)
+        expected = paired_bootstrap(mine, realism)
+        for end in ("mean", "low", "high"):
+            assert getattr(found.change, end) == pytest.approx(getattr(expected, end), abs=1e-12)
     assert matched_difference(made.rows("mine", *sharp), base[:1], made) is None, "one decoding makes no line"
 
 
@@ -84,7 +93,7 @@ def test_scenes_without_a_value_are_left_out_everywhere(draw: np.random.Generato
     made.files["reference 1 2"]["realism"][4] = None
     made.files["mine 0"]["spread"][5] = None
     found = matched_difference(mine, base, made, num_resamples=100)
-    assert found is not None and found.num_scenes == SCENES - 2 and found.low == pytest.approx(0.1)
+    assert found is not None and found.change.num_scenes == SCENES - 2 and found.change.low == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize("missing", ["file", "figure", "seed", "scene"])

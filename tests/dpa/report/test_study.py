@@ -243,9 +243,9 @@ def test_decoding_matched_curves_have_realism_over_spread_and_mark_the_chosen_de
     bars = zip(line["error_y"]["array"], line["error_y"]["arrayminus"], strict=True)
     for x, hover, (up, down) in zip(line["x"], line["hovertext"], bars, strict=True):
         found = matched_difference(tuned.of("dpa_omf", at[x]), base, files)
-        reach = (0, 0) if found is None else (found.high - found.mean, found.mean - found.low)
-        assert (up, down) == pytest.approx(reach, rel=1e-4)
-        assert ("at equal sharpness" in hover) == (found is not None)
+        assert found is not None and "at equal sharpness" in hover
+        change = found.change
+        assert (up, down) == pytest.approx((change.high - change.mean, change.mean - change.low), rel=1e-4)
     assert any(line["error_y"]["array"]) and "error_y" not in trace(figure, "reference")
 
 
@@ -481,6 +481,14 @@ def test_methods_whose_loss_saturated_are_named_with_their_seeds(page: Page, cop
     assert Page(report(copied, tmp_path / "out").read_text(encoding="utf-8")).text.count(told) == 1
     assert report(copied, tmp_path / "tables.md").read_text(encoding="utf-8").count(told) == 1
     assert "Saturated: " not in page.text
+
+
+def test_a_run_without_curves_is_named_by_the_warning_in_its_result(copied: Path, tmp_path: Path) -> None:
+    for seed in SEEDS:
+        run = copied / f"seed_{seed}" / "dpa_omf"
+        write(run / "result.json", {"options": {}} if seed else {"options": {}, "saturated": "75 % of the pairs"})
+        shutil.rmtree(run / "scalars")
+    assert "Saturated: DPA-OMF (1 of 3 seeds)." in report(copied, tmp_path / "tables.md").read_text(encoding="utf-8")
 
 
 def test_what_the_papers_method_is_here_is_said_below_its_table(page: Page, copied: Path, tmp_path: Path) -> None:
