@@ -215,7 +215,18 @@ def _bootstrap(values: NDArray[np.float64], num_resamples: int, seed: int) -> In
 
 
 def interval_of(mean: float, resampled: NDArray[np.float64], num_seeds: int, num_scenes: int) -> Interval:
-    """The percentile interval of a figure from its values in every resample."""
+    """The 95 % percentile interval of a figure from its values in every resample.
+
+    Args:
+        mean: the figure itself.
+        resampled: the same of each resample, ``[num_resamples]``.
+        num_seeds: that were drawn from; of a single one the interval is over scenes alone.
+        num_scenes: that were drawn from.
+
+    Examples:
+        >>> interval_of(0.5, np.linspace(0, 1, 1001), num_seeds=5, num_scenes=72)
+        Interval(mean=0.5, low=0.025, high=0.975, over='seeds and scenes', num_seeds=5, num_scenes=72)
+    """
     low, high = np.quantile(resampled, [0.025, 0.975])
     over = SCENES if num_seeds == 1 else SEEDS_AND_SCENES
     return Interval(mean, float(low), float(high), over, num_seeds, num_scenes)
