@@ -1,9 +1,11 @@
-"""How one method of an experiment differs from another in every measure, paired by seed and scene.
+"""How one method of an experiment, or one evaluation, differs from another in every measure, paired by seed and scene.
 
     python -m recipes.difference RUNS EXPERIMENT METHOD OTHER
+    python -m recipes.difference EVALUATION OTHER
 
 RUNS is the folder that recipes.compare fills (its output), or an archive of one, unpacked. Each method stands at its
-own best decoding, or at those that are given. From the values of every scene: nothing is run.
+own best decoding, or at those that are given. EVALUATION is what recipes.evaluate writes, a JSON, or a folder with one
+for each seed. From the values of every scene: nothing is run.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from typing import NamedTuple
 from rich.console import Console
 from rich.table import Table
 
-from dpa.report.experiment import Decoding, Experiment, decoding_of, in_words, read_experiment
+from dpa.report.experiment import Decoding, Experiment, decoding_of, in_words, read_experiment, read_json
 from dpa.report.paired import Rows, paired_values
 from dpa.report.statistics import Interval, paired_bootstrap
 from dpa.report.study import Evaluations
@@ -67,12 +69,64 @@ def differences(
     kept = [row for row in experiment.likelihood if Path(row["file"]).parent in policies]
     likely = [[row for row in kept if row["method"] == name] for name in (method, other)]
     for mine, base in (evaluated, likely):
-        measures = evaluations(mine[0]["file"]) if mine else None
-        for measure in measures or ():
-            both = paired_values(mine, base, measure, evaluations)
-            if both is not None:
-                ahead = int((both[0].mean(-1) > both[1].mean(-1)).sum())
-                yield Difference(measure, both[0].mean(), both[1].mean(), paired_bootstrap(*both), ahead)
+        yield from _measures(mine, base, evaluations)
+
+
+def differences_of_files(evaluation: Path, other: Path) -> Iterator[Difference]:
+    """Every measure of one evaluation, or of one for each seed, minus another.
+
+    Args:
+        evaluation: a JSON of ``recipes.evaluate``, or a folder with several of as many seeds.
+        other: likewise, of the same scenes and seeds.
+
+    Raises:
+        ValueError: no such file, two of one seed, or evaluations of other seeds, scenes, metric, rollouts or ranking.
+    """
+    sides = [_read_seeds(path) for path in (evaluation, other)]
+    if sides[0].keys() != sides[1].keys():
+        mine, base = (", ".join(map(str, side)) for side in sides)
+        raise ValueError(
+            f"{evaluation} has seeds {mine} and {other} has seeds {base}; evaluate both with the same `seed`s."
+        )
+    for seed, path in sides[0].items():
+        mine, base = (read_json(each)["options"] for each in (path, sides[1][seed]))
+        differ = next((name for name in ("scenes", "evaluation", "ranking") if mine[name] != base[name]), None)
+        if differ is not None:
+            raise ValueError(
+                f"{path} and {sides[1][seed]} were evaluated with other {differ!r}, {mine[differ]} and {base[differ]}; "
+                "evaluate both with the same."
+            )
+    rows = [[{"seed": seed, "file": str(path.absolute())} for seed, path in side.items()] for side in sides]
+    yield from _measures(*rows, Evaluations(Path()))
+
+
+def _read_seeds(path: Path) -> dict[int, Path]:
+    """Evaluations by seed, in its order."""
+    files = sorted(path.glob("*.json")) if path.is_dir() else [path]
+    found: dict[int, Path] = {}
+    for file in files:
+        content = read_json(file) if file.is_file() else None
+        if not isinstance(content, dict) or not {"per_scene", "options"} <= content.keys():
+            raise ValueError(
+                f"{file} is no evaluation that recipes.evaluate wrote; for two methods of an experiment say RUNS "
+                "EXPERIMENT METHOD."
+            )
+        seed = content["options"]["seed"]
+        if seed in found:
+            raise ValueError(f"{found[seed]} and {file} are both of seed {seed}; give a folder with one for each.")
+        found[seed] = file
+    if not found:
+        raise ValueError(f"{path} has no evaluation, a file NAME.json that recipes.evaluate writes.")
+    return dict(sorted(found.items()))
+
+
+def _measures(mine: Rows, base: Rows, evaluations: Evaluations) -> Iterator[Difference]:
+    measures = evaluations(mine[0]["file"]) if mine else None
+    for measure in measures or ():
+        both = paired_values(mine, base, measure, evaluations)
+        if both is not None:
+            ahead = int((both[0].mean(-1) > both[1].mean(-1)).sum())
+            yield Difference(measure, both[0].mean(), both[1].mean(), paired_bootstrap(*both), ahead)
 
 
 def _rows(experiment: Experiment, method: str, decoding: Decoding | None) -> Rows:
@@ -116,9 +170,9 @@ def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m recipes.difference", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("runs", metavar="RUNS", type=Path, help="folder of results")
-    parser.add_argument("experiment", metavar="EXPERIMENT", help="name of it, such as methods")
-    parser.add_argument("method", metavar="METHOD", help="such as dpa_omf")
+    parser.add_argument("runs", metavar="RUNS", type=Path, help="folder of results, or an evaluation")
+    parser.add_argument("experiment", metavar="EXPERIMENT", help="name of it, such as methods, or another evaluation")
+    parser.add_argument("method", metavar="METHOD", nargs="?", help="such as dpa_omf; none with two evaluations")
     parser.add_argument("other", metavar="OTHER", nargs="?", default="reference", help="by default the reference")
     parser.add_argument(
         "--at", metavar="TOP_P,T", type=decoding, nargs="+", default=[], help="decoding of both, or one of each"
@@ -130,19 +184,29 @@ def main() -> None:
     """Entry point of ``python -m recipes.difference``."""
     given = make_parser().parse_args()
     try:
-        path = given.runs / "experiments" / f"{given.experiment}.json"
-        if not path.is_file():
-            known = ", ".join(sorted(each.stem for each in path.parent.glob("*.json"))) or "none"
-            raise ValueError(f"{given.runs} has no experiment {given.experiment!r}; it has {known}.")
-        if len(given.at) > 2:
-            raise ValueError(f"--at takes one decoding for both, or one of each, got {len(given.at)}.")
-        experiment = read_experiment(path)
-        found = list(differences(experiment, given.method, given.other, Evaluations(given.runs), given.at))
+        if given.method is None:
+            if given.at:
+                raise ValueError("--at chooses decodings of an experiment's methods; an evaluation has its own.")
+            names = str(given.runs), given.experiment
+            found = list(differences_of_files(*map(Path, names)))
+        else:
+            names = given.method, given.other
+            found = list(_of_experiment(given))
         if not found:
-            raise ValueError(f"{given.method} and {given.other} of {path} have no seed and scene in common.")
+            raise ValueError(f"{' and '.join(names)} have no seed and scene in common.")
     except (ValueError, OSError) as error:
         sys.exit(refused(error))
-    _print(found, given.method, given.other)
+    _print(found, *names)
+
+
+def _of_experiment(given: argparse.Namespace) -> Iterator[Difference]:
+    path = given.runs / "experiments" / f"{given.experiment}.json"
+    if not path.is_file():
+        known = ", ".join(sorted(each.stem for each in path.parent.glob("*.json"))) or "none"
+        raise ValueError(f"{given.runs} has no experiment {given.experiment!r}; it has {known}.")
+    if len(given.at) > 2:
+        raise ValueError(f"--at takes one decoding for both, or one of each, got {len(given.at)}.")
+    return differences(read_experiment(path), given.method, given.other, Evaluations(given.runs), given.at)
 
 
 def _print(found: Sequence[Difference], method: str, other: str) -> None:

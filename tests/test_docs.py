@@ -153,7 +153,7 @@ def test_a_plan_takes_the_options_that_a_command_gives(command: str) -> None:
 
 @pytest.mark.parametrize("command", [command for command in COMMANDS if command.startswith("recipes.difference ")])
 def test_a_difference_takes_the_arguments_that_a_command_gives(command: str) -> None:
-    assert difference_parser().parse_args(shlex.split(command)[1:]).method
+    assert difference_parser().parse_args(shlex.split(command)[1:]).experiment
 
 
 @pytest.mark.parametrize("command", [command for command in COMMANDS if command.startswith("recipes.report ")])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from dpa.report.experiment import read_experiment
 from dpa.report.statistics import paired_bootstrap
 from dpa.report.study import Evaluations
 from recipes import difference
-from recipes.difference import Difference, differences
+from recipes.difference import Difference, differences, differences_of_files
 from tests.dpa.report.runs import BEST, COMMON, SEEDS, likelihoods, values, write_runs
 
 
@@ -97,6 +98,53 @@ def test_what_is_not_there_is_one_clear_sentence(
     with pytest.raises(SystemExit) as stopped:
         difference.main()
     assert stopped.value.code == 2 and message in capsys.readouterr().err
+
+
+def lay_out(folder: Path, method: str, **options: object) -> Path:
+    """Evaluations of a method, one for each seed."""
+    folder.mkdir()
+    for seed in SEEDS:
+        decided_by = {"seed": seed, "scenes": "a", "evaluation": {"num_rollouts": 32}, "ranking": {}, **options}
+        content = {"options": decided_by, "per_scene": values(method, seed, COMMON)}
+        (folder / f"{10 - seed}.json").write_text(json.dumps(content))
+    return folder
+
+
+def test_evaluations_by_seed_differ_as_the_methods_of_an_experiment_do(runs: Path, tmp_path: Path) -> None:
+    mine, base = (lay_out(tmp_path / name, name) for name in ("dpa_omf", "reference"))
+    expected = found(runs, "dpa_omf", "reference", COMMON)
+    for each in differences_of_files(mine, base):
+        assert each == expected[each.measure]
+    (alone,) = [each for each in differences_of_files(mine / "10.json", base / "10.json") if each.measure == "realism"]
+    assert alone.interval.num_seeds == 1 and alone.interval.over == "scenes"
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        ({"scenes": "b"}, "were evaluated with other 'scenes', a and b; evaluate both with the same"),
+        ({"evaluation": {"num_rollouts": 8}}, "with other 'evaluation', {'num_rollouts': 32} and {'num_rollouts': 8}"),
+        ({"seed": 3}, "8.json are both of seed 3; give a folder with one for each"),
+        (None, "has no evaluation, a file NAME.json"),
+    ],
+)
+def test_evaluations_that_cannot_be_paired_are_refused(other: dict | None, message: str, tmp_path: Path) -> None:
+    mine = lay_out(tmp_path / "mine", "dpa_omf")
+    base = tmp_path / "base"
+    if other is None:
+        base.mkdir()
+    else:
+        lay_out(base, "reference", **other)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        list(differences_of_files(mine, base))
+
+
+def test_seeds_and_files_that_are_not_there_are_told(tmp_path: Path) -> None:
+    mine = lay_out(tmp_path / "mine", "dpa_omf")
+    with pytest.raises(ValueError, match="10.json has seeds 0; evaluate both with the same `seed`s"):
+        list(differences_of_files(mine, mine / "10.json"))
+    with pytest.raises(ValueError, match="nothing is no evaluation .*for two methods of an experiment say RUNS EXPER"):
+        list(differences_of_files(mine, Path("nothing")))
 
 
 def test_the_table_tells_what_is_certain_from_what_is_not(
