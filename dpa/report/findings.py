@@ -149,7 +149,7 @@ def saturated(experiment: Experiment, folder: Path) -> str | None:
 
 
 def _has_saturated(run: Path) -> bool:
-    """Whether the loss of a finished run saturated: by its curves; where it lacks them, by the warning in its result."""
+    """Whether the loss of a finished run saturated: by its curves; by the warning in its result where it lacks them."""
     result = read_json(run / "result.json")
     loss = result.get("options", {}).get("loss")
     curves = read_curves(run) if (run / "scalars").is_dir() else {}
