@@ -20,7 +20,14 @@ from dpa.report.likelihoods import who_learns
 from dpa.report.statistics import paired_bootstrap
 from dpa.report.study import FIRST, Evaluations, Study, read_study
 from dpa.report.table import difference, number
-from dpa.report.text import comparison_table, learnt_table, likelihood_table, safety_table, sharpness_table
+from dpa.report.text import (
+    account_table,
+    comparison_table,
+    learnt_table,
+    likelihood_table,
+    safety_table,
+    sharpness_table,
+)
 from envs import keys
 from envs.convert.__main__ import make_parser as convert_parser
 from envs.sources import SOURCES
@@ -289,6 +296,7 @@ def test_the_tables_of_the_results_are_those_of_the_studies_beside_them(study: S
             None if learnt is None else learnt_table(learnt),
         ]
         assert not [table for table in tables if table is not None and table.rstrip() not in told], experiment.name
+    assert (account_table(study) or "").rstrip() in told
 
 
 @pytest.mark.parametrize("study", [path for path in STUDIES if path.stem == "sumo"], indirect=True)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
+from dpa.report.account import account_rows
 from dpa.report.experiment import Comparison, Experiment, decoding_of
 from dpa.report.findings import budgets, chosen_on_the_same, headline, left_out, ordering, saturated
 from dpa.report.likelihoods import ABOUT_LEARNT, LEARNT, Learnt, likelihoods, shown_figures, who_learns
@@ -37,7 +37,9 @@ def study_text(study: Study) -> str:
     """
     evaluations = Evaluations(study.folder)
     parts = [block for experiment in study.experiments.values() for block in _experiment(experiment, evaluations)]
-    return "\n\n".join([*parts, *_account(study.stages)]) + "\n"
+    if told := account_table(study):
+        parts += ["## Time of one worker", told]
+    return "\n\n".join(parts) + "\n"
 
 
 def _experiment(experiment: Experiment, evaluations: Evaluations) -> Iterator[str]:
@@ -202,11 +204,11 @@ def _made(experiment: Experiment) -> str:
     )
 
 
-def _account(stages: Mapping[str, Mapping[str, float]]) -> Iterator[str]:
-    if not stages:
-        return
-    spent = {name: math.fsum(jobs.values()) for name, jobs in stages.items()}
-    rows = [[name, duration(seconds), str(len(stages[name]))] for name, seconds in spent.items()]
-    rows.append(["all", duration(sum(spent.values())), str(sum(map(len, stages.values())))])
-    yield "## Time of one worker"
-    yield to_markdown(["stage", "time", "jobs"], rows)
+def account_table(study: Study) -> str | None:
+    """Worker time of every stage, by experiment and in all; None where no time is kept.
+
+    Args:
+        study: see :func:`dpa.report.study.read_study`.
+    """
+    rows = account_rows(study)
+    return to_markdown(rows[0], rows[1:]) if rows else None

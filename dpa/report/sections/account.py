@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 
 from dpa.preferences.card import DataCard
+from dpa.report.account import account_rows
 from dpa.report.charts import bars, drawn, lines
 from dpa.report.experiment import SPLITS
 from dpa.report.markup import Html, Section, element, folded, hint, joined, table
@@ -49,11 +50,9 @@ def _stages(study: Study) -> list[Html]:
         x="hours",
         hover=[lines(name, duration(seconds[name]), f"{jobs[name]} jobs") for name in seconds],
     )
-    rows = [[name, duration(seconds[name]), str(jobs[name])] for name in seconds]
-    rows.append(["all", duration(sum(seconds.values())), str(sum(jobs.values()))])
-    shown = table(["stage", "time", "jobs"], rows)
-    note = hint("Time of one worker, each job as it was done first, all experiments together (stages.json).")
-    return [element("div", drawn(chart), element("div", shown, note), class_="gallery")]
+    titles, *rows = account_rows(study)
+    note = hint("Time of one worker, each job as it was done first. Experiments share jobs (stages.json).")
+    return [drawn(chart), table(titles, rows), note]
 
 
 def _scenes(cards: Mapping[str, SceneCard]) -> list[Html]:

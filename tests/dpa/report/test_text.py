@@ -138,9 +138,17 @@ def test_equal_sharpness_is_of_the_reported_scenes_for_every_method_at_its_best_
     assert {name: cells["Δ realism [95 %]"] for name, cells in table.items()} == expected
 
 
-def test_the_account_adds_up(text: str) -> None:
-    account = block(text, "Time of one worker")
-    assert "| pretrain | 1 h 30 min | 3 |" in account and "| all | 2 h 0 min | 12 |" in account
+def test_the_account_has_every_experiment_and_adds_up(text: str, runs: Path) -> None:
+    titles, _, *lines = block(text, "Time of one worker").strip().splitlines()
+    names = [cell.strip() for cell in titles.strip("|").split("|")]
+    rows = [dict(zip(names, (cell.strip() for cell in line.strip("|").split("|")), strict=True)) for line in lines]
+    assert names[0] == "experiment" and rows[-1]["experiment"] == "all, each job once"
+    assert (rows[-1]["pretrain"], rows[-1]["all"]) == ("1 h 30 min", "2 h 0 min")
+    titles_of = [read_experiment(path).title for path in (runs / "experiments").glob("*.json")]
+    assert sorted(row["experiment"] for row in rows[:-1]) == sorted(titles_of)
+    assert {(row["pretrain"], row["align"], row["all"]) for row in rows[:-1]} == {
+        ("1 h 30 min", "2 min 5 s", "1 h 32 min")
+    }
 
 
 if __name__ == "__main__":
