@@ -36,6 +36,7 @@ from recipes import validity
 from recipes.alignment.losses import LOSSES
 from recipes.benchmark.__main__ import make_parser as benchmark_parser
 from recipes.common.models import TOKENIZERS
+from recipes.difference import differences_of_files
 from recipes.difference import make_parser as difference_parser
 from recipes.plan import make_parser as plan_parser
 from recipes.report import make_parser as report_parser
@@ -312,6 +313,30 @@ def test_the_table_of_the_readme_is_that_of_the_study_beside_the_results(study: 
         change = "–" if entry is None else difference(entry["realism_difference"], entry["ci95"])
         label = "a variant: two changes" if name == "variants" else experiment.labels[method]
         assert told[label] == [*(number(of[key], 3) for key in SHOWN), change], label
+
+
+@pytest.mark.parametrize(
+    ("other", "label"),
+    [("top_p_0.9_t_1.0", "top-p 0.9, the reference's best of four"), ("top_p_0.95_t_1.0", "top-p 0.95")],
+)
+def test_the_table_of_a_lower_temperature_is_that_of_the_evaluations_beside_it(
+    other: str, label: str, tmp_path: Path
+) -> None:
+    zipfile.ZipFile(REPOSITORY / "docs/studies/evaluations/reference_sumo.zip").extractall(tmp_path)
+    found = {
+        each.measure: each.interval for each in differences_of_files(tmp_path / "top_p_0.95_t_0.8", tmp_path / other)
+    }
+    cells = [label]
+    for measure, digits, scale in (
+        ("realism", 3, 1),
+        ("map_based", 3, 1),
+        ("collision_rate", 1, 100),
+        ("spread", 2, 1),
+    ):
+        mean, low, high = (scale * end for end in (found[measure].mean, found[measure].low, found[measure].high))
+        cells.append(in_a_cell({"mean": mean, "ci95": (low, high)}, digits))
+        assert found[measure].num_seeds == 5
+    assert f"| {' | '.join(cells)} |" in (REPOSITORY / "docs" / "results.md").read_text(encoding="utf-8")
 
 
 STUDIED_BY = {
