@@ -25,6 +25,7 @@ CARD: Mapping[str, Callable[[DataCard], str]] = {
     "margin over the scene's mean": lambda card: _percent(card.relative_margin),
     "pairs without preference": lambda card: _percent(card.tied_pairs),
     "Spearman of distance and ADE": lambda card: _known(card.spearman, 2),
+    "ADE's pairs ordered alike": lambda card: _percent(card.same_side),
     "a person would take": lambda card: f"{card.human_hours:.1f} h",
     "on disk, per scene": lambda card: f"{card.scene_bytes / 1000:.1f} kB",
 }

@@ -35,6 +35,7 @@ def test_card_of_a_hand_case(folder: Path) -> None:
     assert card.tied_pairs == pytest.approx(1 / 3)
     assert card.margin == pytest.approx((7 + 5 + 7 + 5 + 0 + 0) / 6)
     assert card.spearman == pytest.approx(0)
+    assert card.same_side == pytest.approx((1 + 1 + 0 + 0 + 0.5 + 0.5) / 6)
     seconds = 0.7 + 4.2 * torch.tensor([1, 2, 3]).double() / 9
     assert card.human_hours == pytest.approx(float(seconds.sum()) * 2 / 3600)
 
