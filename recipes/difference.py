@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rich.console import Console
 from rich.table import Table
@@ -88,22 +88,29 @@ def differences_of_files(evaluation: Path, other: Path) -> Iterator[Difference]:
         raise ValueError(
             f"{evaluation} has seeds {mine} and {other} has seeds {base}; evaluate both with the same `seed`s."
         )
-    for seed, path in sides[0].items():
-        mine, base = (read_json(each)["options"] for each in (path, sides[1][seed]))
-        differ = next((name for name in ("scenes", "evaluation", "ranking") if mine[name] != base[name]), None)
-        if differ is not None:
-            raise ValueError(
-                f"{path} and {sides[1][seed]} were evaluated with other {differ!r}, {mine[differ]} and {base[differ]}; "
-                "evaluate both with the same."
-            )
-    rows = [[{"seed": seed, "file": str(path.absolute())} for seed, path in side.items()] for side in sides]
+    for seed, mine in sides[0].items():
+        base = sides[1][seed]
+        for name in ("scenes", "evaluation", "ranking"):
+            if mine.options[name] != base.options[name]:
+                raise ValueError(
+                    f"{mine.file} and {base.file} were evaluated with other {name!r}, {mine.options[name]} and "
+                    f"{base.options[name]}; evaluate both with the same."
+                )
+    rows = [[{"seed": seed, "file": str(each.file.absolute())} for seed, each in side.items()] for side in sides]
     yield from _measures(*rows, Evaluations(Path()))
 
 
-def _read_seeds(path: Path) -> dict[int, Path]:
+class _Evaluation(NamedTuple):
+    """A result of ``recipes.evaluate``, and what it was made with."""
+
+    file: Path
+    options: Mapping[str, Any]
+
+
+def _read_seeds(path: Path) -> dict[int, _Evaluation]:
     """Evaluations by seed, in its order."""
     files = sorted(path.glob("*.json")) if path.is_dir() else [path]
-    found: dict[int, Path] = {}
+    found: dict[int, _Evaluation] = {}
     for file in files:
         content = read_json(file) if file.is_file() else None
         if not isinstance(content, dict) or not {"per_scene", "options"} <= content.keys():
@@ -113,8 +120,8 @@ def _read_seeds(path: Path) -> dict[int, Path]:
             )
         seed = content["options"]["seed"]
         if seed in found:
-            raise ValueError(f"{found[seed]} and {file} are both of seed {seed}; give a folder with one for each.")
-        found[seed] = file
+            raise ValueError(f"{found[seed].file} and {file} are both of seed {seed}; give a folder with one for each.")
+        found[seed] = _Evaluation(file, content["options"])
     if not found:
         raise ValueError(f"{path} has no evaluation, a file NAME.json that recipes.evaluate writes.")
     return dict(sorted(found.items()))

@@ -41,7 +41,7 @@ class Matched(NamedTuple):
 def equal_sharpness(experiment: Experiment, evaluations: Evaluations) -> Iterator[tuple[str, Decoding, Matched]]:
     """Every method at its own best decoding and at the common one, on the scenes that the experiment reports.
 
-    The reference's decodings were all evaluated there, and nothing was chosen there.
+    The reference was evaluated there at every decoding of the grid; decodings are chosen on the tuning scenes.
 
     Args:
         experiment: to show; one that tried a single decoding gives nothing.
@@ -50,7 +50,9 @@ def equal_sharpness(experiment: Experiment, evaluations: Evaluations) -> Iterato
     compared = (experiment.own_best, experiment.at_common)
     base = reference_line(compared, experiment)
     for method in experiment.methods:
-        for decoding in dict.fromkeys((experiment.chosen[method], experiment.common)) if method != REFERENCE else ():
+        if method == REFERENCE:
+            continue
+        for decoding in dict.fromkeys((experiment.chosen[method], experiment.common)):
             mine = _rows(compared, method, decoding)
             if mine and (found := matched_difference(mine, base, evaluations)):
                 yield method, decoding, found
