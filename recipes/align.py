@@ -9,7 +9,7 @@ Methods differ in one YAML each: dpa_omf, dpa_adef, sft_best_oa, sft_best_ade, a
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import hydra
@@ -17,19 +17,16 @@ from omegaconf import DictConfig
 
 from dpa.losses import SaturationWatch
 from dpa.report.curves import read_curves
-from dpa.training.batches import ShuffledOrder, with_tokens
 from dpa.training.distributed import ALONE, Ranks, join_ranks
-from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
 from dpa.training.run import Run
 from dpa.training.seeding import seed_everything
 from envs.files import write_json
 from envs.progress import full_name, message
-from envs.seeding import make_generator
 from envs.store import SceneStore
-from recipes.alignment.candidates import Candidates
-from recipes.alignment.draws import parts_of
 from recipes.alignment.inputs import Inputs
 from recipes.alignment.losses import check_fit, make_loss
+from recipes.alignment.snapshots import Snapshots
+from recipes.alignment.step import AlignmentStep
 from recipes.alignment.watch import Watch
 from recipes.common.cli import CONFIG, check_steps, finished, finite, ranked_recipe
 from recipes.common.models import check_written, write_policy
@@ -86,24 +83,20 @@ def align(
     device = ranks.place(cfg.device)
     inputs = Inputs.open(policy, preferences, expert, scenes, among, device)
     model, decided_by = inputs.model, inputs.deciding(method, options, seed)
-    snapshots = {step: folder / f"step_{step}" / "policy.pt" for step in options.snapshots if step <= options.steps}
+    snapshots = Snapshots.of(folder, options)
     kept = finished(result, decided_by)
     if ranks.agree(kept is not None and path.is_file(), "finished =", folder):
-        check_kept(snapshots, options.steps)
+        snapshots.check(options.steps)
         check_written(path)
         tell(method, kept.get(SATURATED), ranks)
         return path
     seed_everything(seed)
     candidates = inputs.candidates(method.data, seed)
-    check_enough(candidates, options.pairs_per_scene)
     looks = inputs.looks(method.data, options, watch) if ranks.main else []
-    loss = ranks.wrap(make_loss(method.loss, model))
-    optimizer = make_optimizer(model, options.lr, options.weight_decay)
-    schedule = make_schedule(optimizer, options.steps, options.warmup)
-    order = ShuffledOrder(len(candidates), options.scenes_per_step, seed)
+    take = AlignmentStep(model, ranks.wrap(make_loss(method.loss, model)), candidates, options, seed, device, ranks)
     run = Run(
         folder,
-        {"policy": model, "optimizer": optimizer, "schedule": schedule},
+        {"policy": model, "optimizer": take.optimizer, "schedule": take.schedule},
         config=decided_by,
         total_steps=options.steps,
         checkpoint_interval=options.checkpoint_interval,
@@ -112,7 +105,7 @@ def align(
         description=method.name,
         ranks=ranks,
     )
-    check_kept(snapshots, run.first_step)
+    snapshots.check(run.first_step)
     saturation = SaturationWatch(method.loss, f"{section}.loss", run.state.setdefault(SATURATED, {}))
     described = {"method": method.name, "seed": seed, "options": decided_by}
     with run:
@@ -120,17 +113,13 @@ def align(
         for look in looks if run.first_step == 0 else ():
             run.log(look(device), 0)
         for step in run.steps():
-            draw = make_generator(seed, "pairs", step)
-            groups = with_tokens([candidates[i] for i in order(step)])
-            losses = accumulate_gradients(loss, parts_of(groups, options, draw, device, ranks), ranks)
-            norm = clip_and_step(optimizer, options.max_norm, schedule)
-            tell(method, saturation(step, losses), ranks)
-            run.log({f"train/{key}": value for key, value in losses.items()} | {"train/gradient_norm": norm})
-            done = step + 1
+            figures, done = take(step), step + 1
+            tell(method, saturation(step, figures), ranks)
+            run.log({f"train/{key}": value for key, value in figures.items()})
             for look in looks if done % options.watch_interval == 0 or done == options.steps else ():
                 run.log(look(device))
-            if ranks.main and done in snapshots:
-                write_policy(snapshots[done], model, inputs.config, described | {"step": done})
+            if ranks.main:
+                snapshots.keep(done, model, inputs.config, described)
     if ranks.main:
         write_policy(path, model, inputs.config, described)
         last = {name: finite(curve["value"][-1]) for name, curve in read_curves(folder).items()}
@@ -144,34 +133,6 @@ def tell(method: DictConfig, warning: str | None, ranks: Ranks) -> None:
     """Say what is wrong with a run, if anything is, under the name of its bar: others may write beside it."""
     if warning is not None and ranks.main:
         message(f"{full_name(method.name)}: {warning}")
-
-
-def check_kept(snapshots: Mapping[int, Path], done: int) -> None:
-    """Refuse to go on with a run that kept other snapshots of the steps done: they cannot be had any more.
-
-    Raises:
-        ValueError: one is missing.
-    """
-    for step, path in snapshots.items():
-        if step <= done and not path.is_file():
-            raise ValueError(
-                f"{path.parent.parent} was trained without a snapshot of step {step}, which alignment.snapshots asks "
-                "for; remove that folder to train it again, or leave the snapshot out."
-            )
-
-
-def check_enough(candidates: Candidates, pairs_per_scene: int) -> None:
-    """Refuse scenes that give a step different numbers of pairs: they do not fit in one batch.
-
-    Raises:
-        ValueError: some scenes have fewer pairs than a step takes, and others have more.
-    """
-    counts = candidates.counts
-    if len(counts) > 1 and min(counts) < pairs_per_scene:
-        raise ValueError(
-            f"alignment.pairs_per_scene={pairs_per_scene} and scenes have {min(counts)} to {max(counts)} pairs after "
-            f"method.data.margin and rankings_per_scene; say alignment.pairs_per_scene={min(counts)}."
-        )
 
 
 @hydra.main(**CONFIG, config_name="align")

@@ -701,7 +701,7 @@ def test_a_run_that_goes_on_tells_again_what_saturated_before_it_was_interrupted
     run: Callable, options: Callable, runs: Path, tmp_path: Path
 ) -> None:
     command = saturating(runs, options, tmp_path / "cpl")
-    with mock.patch("recipes.align.clip_and_step", _interrupted_after(3)):
+    with mock.patch("recipes.alignment.step.clip_and_step", _interrupted_after(3)):
         first = run("align", *command)
     assert first.status == 130
     (told,) = warnings_in(first.err)
