@@ -22,7 +22,7 @@ def account_rows(study: Study) -> list[list[str]]:
     """
     if not study.stages:
         return []
-    total = {name: math.fsum(jobs.values()) for name, jobs in study.stages.items()}
+    total = study.seconds
     rows = [["experiment", *total, "all"]]
     for label, spent in [*((each.title, each.stages) for each in study.experiments.values()), (ONCE, total)]:
         known = [spent.get(name) for name in total]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,6 +45,11 @@ class Study:
     def main(self) -> Experiment | None:
         """The experiment that the headline is of: the first one."""
         return next(iter(self.experiments.values()), None)
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Time of one worker of each stage, each job once."""
+        return {name: math.fsum(jobs.values()) for name, jobs in self.stages.items()}
 
 
 def read_study(folder: str | Path) -> Study:

@@ -43,13 +43,12 @@ def account_section(study: Study) -> Section | None:
 def _stages(study: Study) -> list[Html]:
     if not study.stages:
         return []
-    seconds = {name: math.fsum(jobs.values()) for name, jobs in study.stages.items()}
-    jobs = {name: len(entry) for name, entry in study.stages.items()}
+    seconds = study.seconds
     chart = bars(
         {name: spent / 3600 for name, spent in seconds.items()},
         f"Hours of each stage, {duration(sum(seconds.values()))} in all",
         x="hours",
-        hover=[lines(name, duration(seconds[name]), f"{jobs[name]} jobs") for name in seconds],
+        hover=[lines(name, duration(seconds[name]), f"{len(study.stages[name])} jobs") for name in seconds],
     )
     titles, *rows = account_rows(study)
     note = hint("Time of one worker, each job as it was done first. Experiments share jobs (stages.json).")
