@@ -77,7 +77,7 @@ def align(
     Raises:
         ValueError: preferences of other scenes or of another policy, an unknown loss, or options that do not fit it.
     """
-    check_fit(method)
+    check_fit(method, cfg.alignment)
     options, path, result = cfg.alignment, folder / "policy.pt", folder / "result.json"
     ranks.share_of(options.scenes_per_step, "alignment.scenes_per_step")
     device = ranks.place(cfg.device)

@@ -36,17 +36,26 @@ def make_loss(section: DictConfig, model: MotionLM) -> LossModule:
     return build(LOSSES[section.kind], DictConfig(options), f"method.loss ({section.kind})", token_network(model))
 
 
-def check_fit(method: DictConfig) -> None:
+def check_fit(method: DictConfig, alignment: DictConfig) -> None:
     """Refuse a loss that would misread what the method learns from; a loss that has no ``sides`` takes anything.
 
+    Args:
+        method: ``data`` and ``loss``, from ``config/method``.
+        alignment: the section, of which ``pairs_per_scene`` is read.
+
     Raises:
-        ValueError: for instance a ranking loss for pairs.
+        ValueError: for instance a ranking loss for pairs, or for rankings of two.
     """
     data = method.data
     if method.loss.get("credit") == "agent" and not (data.kind == "pairs" and data.rank_by == keys.DISTANCE):
         raise ValueError(
             "method.loss.credit=agent needs pairs that agents are ranked in one by one: method.data.kind=pairs and "
             f"rank_by={keys.DISTANCE}, got {data.kind} and {data.get('rank_by')}."
+        )
+    if method.loss.kind == "plackett_luce" and alignment.pairs_per_scene < 2:
+        raise ValueError(
+            "method.loss.kind=plackett_luce ranks 2 * alignment.pairs_per_scene rollouts, and of two it is the loss of "
+            f"a pair; got alignment.pairs_per_scene={alignment.pairs_per_scene}, say for example 4, or method=dpo."
         )
     wanted = getattr(LOSSES.get(method.loss.kind), "sides", None)
     given = SIDES.get(method.data.kind)

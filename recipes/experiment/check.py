@@ -102,15 +102,14 @@ def _check_methods(cfg: DictConfig) -> None:
                 f"methods.{name} has no option {unknown[0]!r}; it takes name, data and loss; what else sets it apart "
                 f"stands in experiment.setup.{name}."
             )
+        if unknown := sorted(set(setup.alignment) - set(cfg.alignment)):
+            raise ValueError(f"experiment.setup.{name}.alignment has no option {unknown[0]!r}.")
+        alignment = setup.merged(cfg.alignment)
         with told_of(f"methods.{name}"):
-            check_fit(cfg.methods[name])
+            check_fit(cfg.methods[name], alignment)
             check_data(cfg.methods[name].data, cfg.collection.num_rollouts)
             make_loss(cfg.methods[name].loss, model)
-        unknown = sorted(set(setup.alignment) - set(cfg.alignment))
-        if unknown:
-            raise ValueError(f"experiment.setup.{name}.alignment has no option {unknown[0]!r}.")
-        with told_of(f"methods.{name}"):
-            check_steps(setup.merged(cfg.alignment), "alignment")
+            check_steps(alignment, "alignment")
 
 
 def _check_texts(experiment: DictConfig) -> None:

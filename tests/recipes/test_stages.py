@@ -12,10 +12,12 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import pytest
 import torch
+from tensordict import TensorDict
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
@@ -361,14 +363,23 @@ def test_pairs_ranked_by_distance_say_what_each_agent_prefers(runs: Path, option
     assert all(group.agent_preference is None for group in pairs_of(runs, options, rank_by="ade"))
 
 
-def test_rollouts_of_an_expert_stand_against_those_of_the_reference(runs: Path, options: Callable) -> None:
-    expert = PreferenceStore(runs / "preferences")
-    groups = pairs_of(runs, options, expert, kind="expert", num=4)
+class ExpertStore(PreferenceStore):
+    """Rollouts of a policy that takes the next token of the vocabulary wherever the reference takes one."""
+
+    def read(self, *arguments: Any, **options: Any) -> TensorDict:
+        group = super().read(*arguments, **options)
+        return group.set(keys.TOKENS, group[keys.TOKENS] + 1)
+
+
+def test_rollouts_of_an_expert_are_preferred_to_those_of_the_reference(runs: Path, options: Callable) -> None:
+    store = PreferenceStore(runs / "preferences")
+    groups = pairs_of(runs, options, ExpertStore(store.folder), kind="expert", num=4)
     assert len(groups) == 6
     for row, group in enumerate(groups):
-        every = expert.read([row], num_agents=group.preferred.shape[1])[keys.TOKENS][0].flatten(1).tolist()
-        for side in (group.preferred, group.unpreferred):
-            assert sorted(side.flatten(1).tolist()) == sorted(every), "all four of each, drawn without repetition"
+        every = store.read([row], num_agents=group.preferred.shape[1])[keys.TOKENS][0]
+        for side, drawn_from in ((group.preferred, every + 1), (group.unpreferred, every)):
+            drawn, rollouts = (sorted(each.flatten(1).tolist()) for each in (side, drawn_from))
+            assert drawn == rollouts, "all four of each, drawn without repetition"
 
 
 def test_the_log_stands_against_rollouts_that_nothing_ranked(runs: Path, options: Callable) -> None:
@@ -485,13 +496,14 @@ def test_every_method_aligns_the_reference(
 
 
 @pytest.mark.parametrize(
-    ("method", "start"), [("kto", 0.5), ("listwise", 0.693147), ("ipo", 0.25), ("per_agent", 0.693147), ("simpo", None)]
+    ("method", "start"), [("kto", 0.5), ("listwise", 1.059351), ("ipo", 0.25), ("per_agent", 0.693147), ("simpo", None)]
 )
 def test_other_losses_align_the_reference(
     run: Callable, options: Callable, runs: Path, tmp_path: Path, method: str, start: float | None
 ) -> None:
     given = [f"method={method}", "method.data.num=2", f"output={tmp_path / method}"]
     given += ["method.data.num_unpreferred=2"] if method == "kto" else []
+    given += ["alignment.pairs_per_scene=2", "method.data.num=4"] if method == "listwise" else []
     given += [f"policy={runs / 'reference/policy.pt'}", f"preferences={runs / 'preferences'}"]
     outcome = run("align", *options("align", *given))
     assert outcome.status == 0, outcome.err
@@ -507,9 +519,10 @@ CONFIGURED = sorted(path.stem for path in Path(CONFIG["config_path"], "method").
 @pytest.mark.parametrize("method", CONFIGURED)
 def test_the_loss_of_every_method_can_be_built_and_reads_its_data(method: str) -> None:
     with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):
-        section = compose("align", [f"method={method}"]).method
+        cfg = compose("align", [f"method={method}", "alignment.pairs_per_scene=2"])
+    section = cfg.method
     assert section.name == method
-    check_fit(section)
+    check_fit(section, cfg.alignment)
     loss = make_loss(section.loss, MotionLM("nano", VerletTokenizer()))
     given = {key for key in section.loss if key != "kind"}
     assert given == set(inspect.signature(type(loss)).parameters) - {"actor_network"}, "the YAML shows every option"
@@ -527,7 +540,17 @@ def test_the_loss_of_every_method_can_be_built_and_reads_its_data(method: str) -
 )  # fmt: skip
 def test_a_loss_that_would_misread_the_data_is_refused(loss: str, data: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        check_fit(OmegaConf.create({"loss": {"kind": loss}, "data": {"kind": data}}))
+        check_fit(
+            OmegaConf.create({"loss": {"kind": loss}, "data": {"kind": data}}),
+            OmegaConf.create({"pairs_per_scene": 2}),
+        )
+
+
+def test_a_ranking_of_two_is_refused_before_anything_is_read(run: Callable, options: Callable, tmp_path: Path) -> None:
+    given = ["method=listwise", f"policy={tmp_path}/none", f"preferences={tmp_path}/none", f"output={tmp_path / 'run'}"]
+    outcome = run("align", *options("align", *given))
+    assert outcome.status == 2 and "got alignment.pairs_per_scene=1, say for example 4" in outcome.err
+    assert not (tmp_path / "run").exists()
 
 
 def watched(runs: Path, options: Callable, folder: Path, *more: str) -> list[str]:

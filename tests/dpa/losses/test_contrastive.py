@@ -63,6 +63,7 @@ def test_the_loss_is_equation_4(
     assert out["logit_std"].item() == pytest.approx(abs(logits[0] - logits[1]) / 2, abs=1e-5)
     weights = [1 / (1 + math.exp(logit)) for logit in logits]
     assert out["weight_mean"].item() == pytest.approx(sum(weights) / 2, abs=1e-5)
+    assert out["weight_std"].item() == pytest.approx(abs(weights[0] - weights[1]) / 2, abs=1e-5)
     likelier = [log_likelihood(now, p) > log_likelihood(now, u) for p, u in zip(*sides(batch), strict=True)]
     assert out["pair_accuracy"].item() == pytest.approx(sum(likelier) / 2)
 
@@ -116,6 +117,24 @@ def test_the_squared_link_is_ipo_up_to_a_factor(network: tuple, batch: TensorDic
     assert out["weight_mean"].item() == pytest.approx(sum(1 - 2 * beta * gap for gap in gaps) / 2, abs=1e-5)
 
 
+COSTS: dict[str, Callable[[float], float]] = {
+    "logistic": lambda h: -math.log(sigmoid(h)),
+    "squared": lambda h: (h - 0.5) ** 2,
+    "hinge": lambda h: max(0.0, 1 - h),
+}
+
+
+@pytest.mark.parametrize("link", sorted(COSTS))
+def test_label_smoothing_is_the_cost_with_some_pairs_the_wrong_way_round(
+    network: tuple, batch: TensorDict, trained: Callable, link: str
+) -> None:
+    actor, start = network
+    loss = ContrastivePreferenceLoss(actor, link=link, alpha=0.5, label_smoothing=0.2)
+    logits = logits_of(trained(loss), start, batch, 0.5)
+    expected = sum(0.8 * COSTS[link](h) + 0.2 * COSTS[link](-h) for h in logits) / 2
+    assert loss(batch)["loss_preference"].item() == pytest.approx(expected, abs=1e-5)
+
+
 def test_label_smoothing_is_conservative_dpo(network: tuple, batch: TensorDict, trained: Callable) -> None:
     actor, start = network
     loss = ContrastivePreferenceLoss(actor, alpha=0.5, label_smoothing=0.2)
@@ -161,15 +180,23 @@ def test_pairs_of_unequal_sides_are_refused(network: tuple, make_batch: Callable
 
 
 # --- credit by agent ------------------------------------------------------------------------------------------------
-def by_agents(now: Tensor, start: Tensor, batch: TensorDict, say: list[list[int]], conservative: float) -> list[float]:
-    """What each pair costs with alpha 1: the mean over its agents that have a say."""
+def by_agents(
+    now: Tensor,
+    start: Tensor | None,
+    batch: TensorDict,
+    say: list[list[int]],
+    conservative: float = 1.0,
+    margin: float = 0.0,
+    share: tuple[float, ...] = (1.0, 1.0),
+) -> list[float]:
+    """What each pair costs with alpha 1: the mean over its agents that have a say; ``share`` of each one's sum."""
     costs = []
     for preferred, unpreferred, voices in zip(*sides(batch), say, strict=True):
         terms = []
         for agent, voice in enumerate(voices):
             better, worse = (preferred, unpreferred) if voice > 0 else (unpreferred, preferred)
-            logit = gain(now, start, better, agent) - conservative * gain(now, start, worse, agent)
-            terms += [-math.log(sigmoid(logit))] if voice else []
+            ahead = gain(now, start, better, agent) - conservative * gain(now, start, worse, agent)
+            terms += [-math.log(sigmoid(share[agent] * ahead - margin))] if voice else []
         costs.append(sum(terms) / max(len(terms), 1))
     return costs
 
@@ -184,6 +211,23 @@ def test_each_agent_is_compared_in_its_own_direction(
     now = trained(loss)
     out = loss(batch.set("agent_preference", torch.tensor([say])))
     expected = by_agents(now, start, batch, say, conservative)
+    assert out["loss_preference"].item() == pytest.approx(sum(expected) / 2, abs=1e-5)
+
+
+@pytest.mark.parametrize("reference", [True, False])
+@pytest.mark.parametrize(
+    ("reduction", "share"), [("sum", (1, 1)), ("agent_mean", (1, 1)), ("token_mean", (1 / 3, 1))]
+)  # three decisions of the first agent count, one of the second
+def test_an_agents_own_score_is_reduced_over_its_own_tokens(
+    network: tuple, batch: TensorDict, trained: Callable, reduction: str, share: tuple[float, ...], reference: bool
+) -> None:
+    actor, start = network
+    loss = ContrastivePreferenceLoss(
+        actor, credit="agent", alpha=1.0, margin=0.3, reference=reference, score_reduction=reduction
+    )
+    now, say = trained(loss), [[1, -1], [-1, 0]]
+    out = loss(batch.set("agent_preference", torch.tensor([say])))
+    expected = by_agents(now, start if reference else None, batch, say, margin=0.3, share=share)
     assert out["loss_preference"].item() == pytest.approx(sum(expected) / 2, abs=1e-5)
 
 
