@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dpa.preferences import PreferenceStore
-from dpa.preferences.card import DataCard, data_card
+from dpa.preferences.card import DataCard
+from dpa.report.cards import read_preference_cards
 from dpa.report.experiment import Experiment, read_experiment, read_json
 from dpa.report.scenes import SceneCard, read_scene_cards
 
@@ -81,7 +81,7 @@ def read_study(folder: str | Path) -> Study:
         players=read_json(players) if players.is_file() else None,
         summaries=summaries,
         scenes=read_scene_cards(scenes) if scenes.is_file() else {},
-        cards=_cards(folder),
+        cards=read_preference_cards(folder),
     )
 
 
@@ -92,15 +92,6 @@ def _account(path: Path) -> dict[str, dict[str, float]]:
     if not all(isinstance(each, dict) and all(type(s) in (int, float) for s in each.values()) for each in jobs):
         raise ValueError(f"{path} is no account of worker-seconds by stage and job; remove it, the page does without.")
     return stages
-
-
-def _cards(folder: Path) -> dict[str, DataCard]:
-    found = {}
-    for path in sorted(folder.glob("seed_*/preferences_*/metadata.json")):
-        store = PreferenceStore(path.parent)
-        if len(store):
-            found[path.parent.relative_to(folder).as_posix()] = data_card(store)
-    return found
 
 
 class Evaluations:

@@ -10,9 +10,10 @@ from typing import Any
 
 from omegaconf import DictConfig
 
+from dpa.report.cards import preference_rows, read_preference_cards
 from dpa.report.experiment import Comparison, Experiment
 from dpa.report.figures import plot_comparison
-from dpa.report.likelihoods import FIGURES
+from dpa.report.likelihoods import FIGURES, LEARNT, Learnt, who_learns
 from dpa.report.matched import equal_sharpness
 from dpa.report.scenes import read_scene_cards
 from dpa.report.sections.safety import MEASURES
@@ -75,6 +76,8 @@ def _tables(experiment: Experiment, runs: RunFolder) -> Iterator[tuple[str, Cell
         yield f"{name}/safety", _measured(records, SAFETY)
     if experiment.likelihood:
         yield "likelihood/methods", _measured(summarise(experiment.likelihood), FIGURES)
+        if learnt := who_learns(experiment, Evaluations(runs.root)):
+            yield "learnt/methods", _learnt(learnt)
     yield "tuning/decodings", _measured(summarise(experiment.tuning), TUNING)
     if rows := list(_equal_sharpness(experiment, Evaluations(runs.root))):
         titles = ["method", *DECODING.values(), "spread [m]", "beyond [m]", "Δ realism", "low", "high"]
@@ -84,11 +87,24 @@ def _tables(experiment: Experiment, runs: RunFolder) -> Iterator[tuple[str, Cell
         yield "account/stages", (["stage", "seconds of one worker"], rows)
     for split, card in (read_scene_cards(runs.scenes) if runs.scenes.is_file() else {}).items():
         yield f"scenes/{split}", (["of all scenes", split], list(card.facts.items()))
+    if cards := read_preference_cards(runs.root):
+        titles, *rows = preference_rows(cards)
+        yield "preferences/stores", (titles, rows)
 
 
 def _equal_sharpness(experiment: Experiment, evaluations: Evaluations) -> Iterator[list[Any]]:
     for method, decoding, (change, *place) in equal_sharpness(experiment, evaluations):
         yield [method, *decoding, *map(_short, (*place, change.mean, change.low, change.high))]
+
+
+def _learnt(learnt: Learnt) -> Cells:
+    """The paper's table 3: figures of its methods, then differences with the ends of their intervals."""
+    ends = [f"{title} {end}" for title in LEARNT.values() for end in ("low", "high")]
+    rows = [[name, *(_short(cell.mean) for cell in row), *([None] * len(ends))] for name, row in learnt.means.items()]
+    for name, changes in learnt.changes.items():
+        found = [[None] * 3 if each is None else [each.mean, each.low, each.high] for each in changes]
+        rows.append([name, *(_short(mean) for mean, *_ in found), *(_short(end) for _, *pair in found for end in pair)])
+    return ["of", *LEARNT.values(), *ends], rows
 
 
 def _measured(records: Sequence[Mapping[str, Any]], figures: Mapping[str, str]) -> Cells:

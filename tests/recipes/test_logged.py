@@ -13,7 +13,9 @@ from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 from tensorboard.backend.event_processing.plugin_event_accumulator import EventAccumulator
 
+from dpa.report.cards import read_preference_cards
 from dpa.report.experiment import read_experiment
+from dpa.report.likelihoods import LEARNT, who_learns
 from dpa.report.matched import equal_sharpness
 from dpa.report.scenes import read_scene_cards
 from dpa.report.study import Evaluations
@@ -25,9 +27,10 @@ from tests.dpa.training.offline import wandb_history
 
 TABLES = {
     "common/methods", "common/safety", "own_best/methods", "own_best/safety", "likelihood/methods", "tuning/decodings",
-    "equal_sharpness/methods", "account/stages", "scenes/train", "scenes/tune", "scenes/eval",
+    "equal_sharpness/methods", "account/stages", "scenes/train", "scenes/tune", "scenes/eval", "learnt/methods",
+    "preferences/stores",
 }  # fmt: skip
-OF_METHODS = {name for name in TABLES if name.partition("/")[0] not in ("account", "scenes")}
+OF_METHODS = {name for name in TABLES if name.partition("/")[0] not in ("account", "scenes", "learnt", "preferences")}
 PICTURES = {
     "own_best/differences", "scenes/likely", "figures/sharpness", "figures/likelihood", "figures/health",
 }  # fmt: skip
@@ -148,6 +151,36 @@ def test_hours_and_data_cards_are_tables(files: tuple[Path, dict[str, Any]], stu
         assert {row["of all scenes"]: row[split] for row in rows_of(folder, f"scenes/{split}")} == dict(card.facts)
     (study / "scenes.json").unlink()
     assert not (logged(study, "csv")[0] / "tables/scenes").exists(), "an older study has no cards"
+
+
+def test_who_learns_the_ranking_is_the_table_of_the_page(files: tuple[Path, dict[str, Any]]) -> None:
+    folder, _ = files
+    learnt = who_learns(read_experiment(folder.with_suffix(".json")), Evaluations(folder.parents[1]))
+    rows = {row["of"]: row for row in rows_of(folder, "learnt/methods")}
+    assert list(rows) == [*learnt.means, *learnt.changes]
+    for name, cells in learnt.means.items():
+        assert [float(rows[name][title]) for title in LEARNT.values()] == pytest.approx(
+            [cell.mean for cell in cells], rel=1e-4
+        )
+        assert rows[name]["realism ↑ low"] == "", "a mean has no interval here"
+    for name, changes in learnt.changes.items():
+        for title, change in zip(LEARNT.values(), changes, strict=True):
+            told = [float(rows[name][column]) for column in (title, f"{title} low", f"{title} high")]
+            assert told == pytest.approx([change.mean, change.low, change.high], rel=1e-4, abs=1e-9)
+
+
+def test_the_cards_of_ranked_rollouts_are_a_table(files: tuple[Path, dict[str, Any]], made: Path) -> None:
+    rows = rows_of(files[0], "preferences/stores")
+    assert [row["store"] for row in rows] == ["seed 0, train", "seed 1, train"]
+    for row, card in zip(rows, read_preference_cards(made).values(), strict=True):
+        assert (row["scenes"], row["pairs"]) == ("3", str(3 * card.pairs))
+
+
+def test_the_experiment_along_an_axis_has_its_figure_in_tensorboard(study: Path) -> None:
+    cfg: DictConfig = OmegaConf.create({"output": str(study), "logger": {"backend": "tensorboard", "mode": "offline"}})
+    folder = log_experiment(cfg, read_experiment(study / "experiments/scaling.json"), {})
+    events = EventAccumulator(str(folder / "tensorboard"), size_guidance={"tensors": 0}).Reload()
+    assert "figures/scaling" in events.Tags()["tensors"]
 
 
 def test_figures_of_the_page_are_pictures(files: tuple[Path, dict[str, Any]]) -> None:

@@ -17,9 +17,9 @@ from unittest import mock
 
 import pytest
 import torch
-from tensordict import TensorDict
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDict
 
 from dpa.losses import ContrastivePreferenceLoss, token_network
 from dpa.policy import ContextOptions, MotionLM, make_context

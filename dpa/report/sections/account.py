@@ -2,33 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 from dpa.preferences.card import DataCard
 from dpa.report.account import account_rows
+from dpa.report.cards import preference_rows
 from dpa.report.charts import bars, drawn, lines
 from dpa.report.experiment import SPLITS
 from dpa.report.markup import Html, Section, element, folded, hint, joined, table
 from dpa.report.scenes import SceneCard
 from dpa.report.study import Study
-from dpa.report.table import MISSING, duration, number
+from dpa.report.table import MISSING, duration
 from envs.card import AGENT_COLUMNS, MAP_COLUMNS
-
-CARD: Mapping[str, Callable[[DataCard], str]] = {
-    "scenes": lambda card: f"{card.scenes}",
-    "rollouts per scene": lambda card: f"{card.rollouts}",
-    "ranked agents": lambda card: f"{card.agents}",
-    "pairs": lambda card: f"{card.scenes * card.pairs}",
-    "margin of a pair": lambda card: _known(card.margin, 3),
-    "margin over the scene's mean": lambda card: _percent(card.relative_margin),
-    "pairs without preference": lambda card: _percent(card.tied_pairs),
-    "Spearman of distance and ADE": lambda card: _known(card.spearman, 2),
-    "ADE's pairs ordered alike": lambda card: _percent(card.same_side),
-    "a person would take": lambda card: f"{card.human_hours:.1f} h",
-    "on disk, per scene": lambda card: f"{card.scene_bytes / 1000:.1f} kB",
-}
 
 MANY = 10
 """Stores that are shown only when asked for."""
@@ -102,33 +88,11 @@ def _by_split(cards: Mapping[str, SceneCard], part: str) -> list[list[str]]:
 def _cards(cards: Mapping[str, DataCard]) -> list[Html]:
     if not cards:
         return []
-    shares = list(dict.fromkeys(feature for card in cards.values() for feature in card.feature_shares))
-    rows = [
-        [
-            name.replace("/preferences_", ", ").replace("_", " "),
-            *(cell(card) for cell in CARD.values()),
-            *(_share(card, feature) for feature in shares),
-        ]
-        for name, card in cards.items()
-    ]
+    titles, *rows = preference_rows(cards)
     origins = [folded(name, element("pre", card.origin.to_json())) for name, card in cards.items()]
-    titles = ["store", *CARD, *(f"distance made of {feature}" for feature in shares)]
     return [
         element("h3", "Ranked rollouts"),
         folded(f"{len(cards)} stores", table(titles, rows), open_=len(cards) < MANY),
         hint("A person: the time that the paper's appendix G gives for ranking as many pairs by hand."),
         folded("what each store came from", *origins),
     ]
-
-
-def _share(card: DataCard, feature: str) -> str:
-    share = card.feature_shares.get(feature)
-    return MISSING if share is None else _percent(share)
-
-
-def _known(value: float, digits: int) -> str:
-    return number(None if math.isnan(value) else value, digits)
-
-
-def _percent(share: float) -> str:
-    return _known(100 * share, 0) + " %"
