@@ -9,6 +9,7 @@ import re
 import shlex
 import zipfile
 from pathlib import Path
+from statistics import fmean
 from typing import Any, NamedTuple
 
 import pytest
@@ -298,6 +299,19 @@ def test_the_tables_of_the_results_are_those_of_the_studies_beside_them(study: S
         ]
         assert not [table for table in tables if table is not None and table.rstrip() not in told], experiment.name
     assert (account_table(study) or "").rstrip() in told
+
+
+@pytest.mark.parametrize("study", [path for path in STUDIES if path.stem == "real"], indirect=True)
+def test_the_policies_of_the_page_of_safety_are_those_of_the_study_beside_the_results(study: Study) -> None:
+    text, evaluations = (REPOSITORY / "docs/safety.md").read_text(encoding="utf-8"), Evaluations(study.folder)
+    experiment = study.experiments[FIRST]
+    for method, label in (("reference", "reference"), ("dpa_omf", "DPA-OMF")):
+        scenes = [evaluations(row["file"]) for row in experiment.at_common.of(method, experiment.common)]
+        means = [
+            fmean(fmean(seed[key]) for seed in scenes) for key in ("wrong_way", "close_pass", "harsh_jerk", "spread")
+        ]
+        cells = [*(number(mean, 3) for mean in means[:3]), number(means[3], 1)]
+        assert len(scenes) == 5 and f"| {label} | {' | '.join(cells)} | |" in text
 
 
 @pytest.mark.parametrize("study", [path for path in STUDIES if path.stem == "sumo"], indirect=True)

@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 
 from dpa.preferences.pairs import nearest_farthest
-from dpa.preferences.provenance import Provenance
+from dpa.preferences.provenance import SHAPE, Provenance
 from dpa.preferences.store import PreferenceStore
 from dpa.ranking.agreement import rank_correlation
 from envs.scene import AgentKind
+from envs.shards import check_shape
 
 ANNOTATION_AGENTS = (1, 10, 20, 40, 80)
 ANNOTATION_SECONDS = (0.7, 4.9, 9.8, 29.4, 42.1)
@@ -23,6 +24,18 @@ ANNOTATION_SECONDS = (0.7, 4.9, 9.8, 29.4, 42.1)
 
 CLASSES = {"vehicle": AgentKind.VEHICLE, "pedestrian": AgentKind.PEDESTRIAN, "cyclist": AgentKind.CYCLIST}
 """Classes that the card tells apart; all others are ``other``."""
+
+
+_NUMBER = float | None
+_SHAPE = {
+    **dict.fromkeys(("scenes", "rollouts", "pairs", "agents", "tied_scenes"), int),
+    **dict.fromkeys(("tied_pairs", "margin", "relative_margin", "spearman", "same_side"), _NUMBER),
+    **dict.fromkeys(("human_hours", "scene_bytes"), _NUMBER),
+    "classes": {str: {"agents": int, "distance": _NUMBER}},
+    "feature_shares": {str: _NUMBER},
+    "origin": SHAPE,
+}
+"""Of what :meth:`DataCard.to_json` gives, see :func:`~envs.shards.check_shape`."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +118,25 @@ class DataCard:
     def to_json(self) -> dict[str, Any]:
         """The same as plain values, None in place of a nan."""
         return _finite(asdict(self))
+
+    @classmethod
+    def from_json(cls, content: Any) -> DataCard:
+        """What :meth:`to_json` gave.
+
+        Raises:
+            ValueError: it is of another shape; the message says where.
+        """
+        check_shape(content, _SHAPE, "card")
+        numbers = {name: _number(content[name]) for name, shape in _SHAPE.items() if shape is _NUMBER}
+        classes = {
+            name: ClassDistance(each["agents"], _number(each["distance"])) for name, each in content["classes"].items()
+        }
+        shares = {name: _number(share) for name, share in content["feature_shares"].items()}
+        return cls(
+            **content
+            | numbers
+            | {"classes": classes, "feature_shares": shares, "origin": Provenance(**content["origin"])}
+        )
 
 
 def data_card(store: PreferenceStore, pairs: int | None = None) -> DataCard:
@@ -203,6 +235,10 @@ def _finite(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _finite(inner) for key, inner in value.items()}
     return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
 
 
 def annotation_seconds(agents: Tensor) -> Tensor:

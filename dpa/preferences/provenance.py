@@ -18,7 +18,7 @@ FORMAT = 3
 METADATA_FILE = "metadata.json"
 MAX_METADATA = 1 << 20
 """Bytes of the metadata file; a usual one has 1,000."""
-_SHAPE = {
+SHAPE = {
     "policy": str,
     "scenes": str,
     "ranking": {str: object},
@@ -107,7 +107,7 @@ class Provenance:
                 f"{path} has format {shown(version)} and this version reads {FORMAT}; collect anew into another folder."
             )
         try:
-            check_shape(values, _SHAPE, "it")
+            check_shape(values, SHAPE, "it")
             check_shape(values["ranking"].get("weights", {}), {str: object}, "its ranking.weights")
         except ValueError as error:
             raise StoreError(f"{path} is damaged ({error}); restore it, or collect anew into another folder.") from None

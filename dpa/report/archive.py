@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import zipfile
 from collections.abc import Iterator
 from fnmatch import fnmatch
 from pathlib import Path
 
+from dpa.report.cards import KEPT as CARDS
+from dpa.report.cards import read_preference_cards
 from envs.files import PARTIAL_PREFIX, whole
 
 KEPT = (".json", ".csv")
 """Endings of files that hold results, options and curves."""
-LEFT_OUT = ("checkpoints", "preferences_*", "players.json", "wandb", "tensorboard")
+LEFT_OUT = ("checkpoints", "preferences_*", CARDS, "players.json", "wandb", "tensorboard")
 """Names of what stays out: scenes and rollouts are large, and the licence of a recording may not let them be handed
-on; files of loggers tell of the machine."""
+on, of which the cards tell instead; files of loggers tell of the machine."""
 EPOCH = (1980, 1, 1, 0, 0, 0)
 """Date of every entry, so that equal studies give equal files."""
 
@@ -22,7 +25,7 @@ def write_archive(path: Path, folder: Path) -> Path:
     """Pack the results of a study with the options, curves and scene-by-scene values behind them.
 
     Unpacked it is a folder of results like the one that it came from: tables, intervals and the page are made from it
-    again, without its scenes to play and its cards of preferences.
+    again, without its scenes to play.
 
     Args:
         path: ``.zip`` to write, in a folder that is there; it appears whole or not at all.
@@ -42,10 +45,16 @@ def write_archive(path: Path, folder: Path) -> Path:
     """
     with whole(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
         for file in files_of(folder):
-            entry = zipfile.ZipInfo(file.relative_to(folder).as_posix(), EPOCH)
-            entry.compress_type = zipfile.ZIP_DEFLATED
-            archive.writestr(entry, file.read_bytes())
+            _add(archive, file.relative_to(folder).as_posix(), file.read_bytes())
+        if cards := {name: card.to_json() for name, card in read_preference_cards(folder).items()}:
+            _add(archive, CARDS, json.dumps(cards, indent=1).encode())
     return path
+
+
+def _add(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
+    entry = zipfile.ZipInfo(name, EPOCH)
+    entry.compress_type = zipfile.ZIP_DEFLATED
+    archive.writestr(entry, content)
 
 
 def files_of(folder: Path) -> Iterator[Path]:

@@ -8,7 +8,10 @@ from pathlib import Path
 
 from dpa.preferences import PreferenceStore
 from dpa.preferences.card import DataCard, data_card
+from dpa.report.experiment import read_json
 from dpa.report.table import MISSING, number
+from envs.shards import check_shape
+from envs.sources.fields import one_line
 
 CARD: Mapping[str, Callable[[DataCard], str]] = {
     "scenes": lambda card: f"{card.scenes}",
@@ -25,18 +28,36 @@ CARD: Mapping[str, Callable[[DataCard], str]] = {
 }
 
 
+KEPT = "preferences.json"
+"""The cards of a study whose stores are elsewhere, as :func:`~dpa.report.archive.write_archive` keeps them."""
+
+
 def read_preference_cards(folder: Path) -> dict[str, DataCard]:
-    """Cards of the stores of a study that hold something, by their folders relative to it.
+    """Cards of the stores of a study that hold something, by their folders relative to it, and those that were kept.
 
     Args:
         folder: of the study.
+
+    Raises:
+        ValueError: :data:`KEPT` holds something else; the message names it.
     """
-    found = {}
+    found = _kept(folder / KEPT) if (folder / KEPT).is_file() else {}
     for path in sorted(folder.glob("seed_*/preferences_*/metadata.json")):
         store = PreferenceStore(path.parent)
         if len(store):
             found[path.parent.relative_to(folder).as_posix()] = data_card(store)
     return found
+
+
+def _kept(path: Path) -> dict[str, DataCard]:
+    content = read_json(path)
+    try:
+        check_shape(content, {str: object}, "it")
+        return {name: DataCard.from_json(card) for name, card in content.items()}
+    except ValueError as error:
+        raise ValueError(
+            f"{path} holds no cards of ranked rollouts ({one_line(error)}); remove it, the page does without."
+        ) from None
 
 
 def preference_rows(cards: Mapping[str, DataCard]) -> list[list[str]]:

@@ -10,7 +10,7 @@ import torch
 
 from dpa.preferences import PreferenceStore, PreferenceWriter, data_card
 from dpa.preferences.__main__ import main
-from dpa.preferences.card import annotation_seconds
+from dpa.preferences.card import DataCard, annotation_seconds
 from dpa.preferences.examples import example_groups, example_provenance
 from envs import keys
 from envs.scene import AgentKind
@@ -69,6 +69,8 @@ def test_a_card_without_agents_or_shares_is_a_card(tmp_path: Path) -> None:
     assert card.agents == 0 and card.tied_scenes == 1 and card.feature_shares == {}
     assert card.to_json()["spearman"] is None and card.to_json()["classes"]["cyclist"]["distance"] is None
     assert "not stored" in str(card)
+    again = DataCard.from_json(json.loads(json.dumps(card.to_json())))
+    assert again.to_json() == card.to_json() and str(again) == str(card)
 
 
 def test_annotation_time_meets_the_points_of_the_paper_and_stays_beyond_the_last() -> None:

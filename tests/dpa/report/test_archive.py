@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from dpa.report.cards import read_preference_cards
 from recipes.report import report
 from tests.dpa.report.runs import write_runs
 
@@ -53,3 +54,23 @@ def test_it_holds_the_values_behind_every_row_and_the_curves_and_neither_weights
 
 def test_equal_studies_give_equal_files(runs: Path, archive: Path, tmp_path: Path) -> None:
     assert report(runs, tmp_path / "again.zip").read_bytes() == archive.read_bytes()
+
+
+def test_the_cards_of_ranked_rollouts_are_in_it_without_their_stores(runs: Path, archive: Path, tmp_path: Path) -> None:
+    zipfile.ZipFile(archive).extractall(tmp_path)
+    assert not list(tmp_path.glob("seed_*/preferences_*"))
+    one, other = (
+        {name: card.to_json() for name, card in read_preference_cards(each).items()} for each in (runs, tmp_path)
+    )
+    assert one == other != {}
+    assert report(tmp_path, tmp_path.parent / "twice.zip").read_bytes() == archive.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("content", "told"), [("[]", "it is [], which it must not be"), ('{"a": {"scenes": -1}}', "card is {'scenes': -1}")]
+)
+def test_a_file_of_cards_that_holds_something_else_is_named(tmp_path: Path, content: str, told: str) -> None:
+    (tmp_path / "preferences.json").write_text(content)
+    with pytest.raises(ValueError, match=r"preferences\.json holds no cards of ranked rollouts .*; remove it") as error:
+        read_preference_cards(tmp_path)
+    assert told in str(error.value)
