@@ -11,6 +11,8 @@ from dpa.report.table import REFERENCE, difference, mean_over_seeds, number
 
 COLOURS, DASHES = ("#2a78b5", "#c79a1b"), ("solid", "dot")
 """Of what is scaled, for the comparisons of an experiment."""
+BEHIND = "#a8a8a8"
+"""Colour of what was scaled where each method has a line of its own."""
 
 
 def scaling_charts(experiment: Experiment, colours: Mapping[str, str]) -> list[Chart]:
@@ -70,7 +72,7 @@ def _against_kl(experiment: Experiment, colours: Mapping[str, str]) -> list[Char
         scaled = [entry for entry in _scaled(experiment, comparison) if entry["method"] in known]
         if experiment.axis is not None and scaled:
             name, values = f"{experiment.axis.name}, {kind}", experiment.axis.values
-            line = _drift(experiment, scaled, kl, name, colour, dash)
+            line = _drift(experiment, scaled, kl, name, BEHIND if bases else colour, dash)
             told = [f"{values[entry['method']]:g}" for entry in scaled]
             content.append(line._replace(error=_errors(scaled), text=told))
         for base in bases:
