@@ -29,6 +29,7 @@ from dpa.report.text import (
     safety_table,
     sharpness_table,
 )
+from dpa.training.loggers import read_curve
 from envs import keys
 from envs.convert.__main__ import make_parser as convert_parser
 from envs.sources import SOURCES
@@ -351,6 +352,17 @@ def test_the_table_of_a_lower_temperature_is_that_of_the_evaluations_beside_it(
         cells.append(in_a_cell({"mean": mean, "ci95": (low, high)}, digits))
         assert found[measure].num_seeds == 5
     assert f"| {' | '.join(cells)} |" in (REPOSITORY / "docs" / "results.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("study", [path for path in STUDIES if path.stem == "drift"], indirect=True)
+def test_the_table_of_pairs_that_return_is_that_of_the_curves_beside_the_results(study: Study) -> None:
+    curves = sorted(study.folder.glob("seed_*/sweep_3e4/scalars/train/pair_accuracy.csv"))
+    seeds = [[value for _, value in read_curve(path.parents[2], "train/pair_accuracy")] for path in curves]
+    passes = [[fmean(seed[first : first + 50]) for seed in seeds] for first in range(0, 300, 50)]
+    told = (REPOSITORY / "docs" / "results.md").read_text(encoding="utf-8")
+    assert [len(seed) for seed in seeds] == [300] * 5
+    for label, of in (("ranked right before the step, mean of five seeds", fmean), ("smallest seed", min)):
+        assert f"| {label} | {' | '.join(number(of(each), 3) for each in passes)} |" in told
 
 
 STUDIED_BY = {
