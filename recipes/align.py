@@ -77,11 +77,11 @@ def align(
     Raises:
         ValueError: preferences of other scenes or of another policy, an unknown loss, or options that do not fit it.
     """
-    check_fit(method, cfg.alignment)
     options, path, result = cfg.alignment, folder / "policy.pt", folder / "result.json"
     ranks.share_of(options.scenes_per_step, "alignment.scenes_per_step")
     device = ranks.place(cfg.device)
     inputs = Inputs.open(policy, preferences, expert, scenes, among, device)
+    check_fit(method, options, inputs.store.provenance.num_rollouts)
     model, decided_by = inputs.model, inputs.deciding(method, options, seed)
     snapshots = Snapshots.of(folder, options)
     kept = finished(result, decided_by)

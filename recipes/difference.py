@@ -25,6 +25,9 @@ from dpa.report.statistics import Interval, paired_bootstrap
 from dpa.report.study import Evaluations
 from recipes.common.cli import refused
 
+COMPARED = ("scenes", "evaluation", "ranking")
+"""Options that two evaluations must share to be compared."""
+
 
 class Difference(NamedTuple):
     """A measure of two methods, over the scenes where both have a value under all seeds.
@@ -90,7 +93,7 @@ def differences_of_files(evaluation: Path, other: Path) -> Iterator[Difference]:
         )
     for seed, mine in sides[0].items():
         base = sides[1][seed]
-        for name in ("scenes", "evaluation", "ranking"):
+        for name in COMPARED:
             if mine.options[name] != base.options[name]:
                 raise ValueError(
                     f"{mine.file} and {base.file} were evaluated with other {name!r}, {mine.options[name]} and "
@@ -117,6 +120,11 @@ def _read_seeds(path: Path) -> dict[int, _Evaluation]:
             raise ValueError(
                 f"{file} is no evaluation that recipes.evaluate wrote; for two methods of an experiment say RUNS "
                 "EXPERIMENT METHOD."
+            )
+        if lacks := sorted({"seed", *COMPARED} - content["options"].keys()):
+            raise ValueError(
+                f"{file} is no evaluation that recipes.evaluate wrote: its options lack {', '.join(lacks)}; "
+                "likelihoods of two methods of an experiment are compared by RUNS EXPERIMENT METHOD."
             )
         seed = content["options"]["seed"]
         if seed in found:
@@ -217,7 +225,9 @@ def _of_experiment(given: argparse.Namespace) -> Iterator[Difference]:
 
 
 def _print(found: Sequence[Difference], method: str, other: str) -> None:
-    table = Table(title=f"{method} minus {other}", title_justify="left")
+    one = found[0].interval.num_seeds == 1
+    told = "; one training run: intervals are over its scenes alone and carry no claim about a method" if one else ""
+    table = Table(title=f"{method} minus {other}{told}", title_justify="left")
     for title in ("measure", method, other, "difference [95 %]", "higher in seeds", "scenes"):
         table.add_column(title, justify="left" if title == "measure" else "right")
     for each in found:
@@ -225,7 +235,7 @@ def _print(found: Sequence[Difference], method: str, other: str) -> None:
         change = f"{between.mean:+.4f} [{between.low:+.4f}, {between.high:+.4f}]"
         seeds = f"{each.ahead} of {between.num_seeds}"
         numbers = (f"{each.mine:.4f}", f"{each.other:.4f}", change, seeds, str(between.num_scenes))
-        table.add_row(each.measure, *numbers, style="bold" if between.excludes_zero else None)
+        table.add_row(each.measure, *numbers, style="bold" if between.excludes_zero and not one else None)
     Console(width=120).print(table)
 
 

@@ -287,6 +287,11 @@ def _check_names(content: Mapping[str, Any], path: Path) -> None:
     for method, label in content["labels"].items():
         if not isinstance(label, str):
             raise ValueError(f"{path}: labels.{method} must be str, got {label!r}; put it in quotes.")
+    for method, figures in content["published"].items():
+        _check(figures, {}, f"{path}: published.{method}")
+        for name, value in figures.items():
+            if not (isinstance(value, NUMBER) and math.isfinite(value)):
+                raise ValueError(f"{path}: published.{method}.{name} must be a number, got {value!r}.")
     trained = {*content["curves"], *content["budget"], *(budget["start"] for budget in content["budget"].values())}
     for method in dict.fromkeys([*methods, *(method.partition("@")[0] for method in methods), *sorted(trained)]):
         if method not in content["labels"]:

@@ -16,6 +16,26 @@ FEW_SEEDS = 5
 """With fewer training runs a bootstrap interval is too narrow; see :func:`dpa.report.statistics.paired_bootstrap`."""
 
 
+SAYS = {"better": "better", "worse": "worse", "open": "not told apart"}
+"""Verdicts in words."""
+
+
+def verdict(entry: Mapping[str, Any]) -> str:
+    """``better``, ``worse`` or ``open``: what a paired difference allows to be said; of one training run, nothing.
+
+    Args:
+        entry: with ``ci95`` and ``over``.
+
+    Examples:
+        >>> [verdict({"ci95": [0.01, 0.02], "over": over}) for over in ("seeds and scenes", "scenes")]
+        ['better', 'open']
+    """
+    low, high = entry["ci95"]
+    if entry["over"] == SCENES:
+        return "open"
+    return "better" if low > 0 else "worse" if high < 0 else "open"
+
+
 def headline(experiment: Experiment) -> str:
     """The result in one sentence that claims no more than the interval does.
 
@@ -165,9 +185,7 @@ def ordering(experiment: Experiment) -> str:
     """Which methods can be told apart from ``experiment.versus``, each at its own best decoding."""
     sides: dict[str, list[str]] = {"better": [], "worse": [], "not told apart": []}
     for entry in experiment.own_best.versus:
-        low, high = entry["ci95"]
-        side = "better" if low > 0 else "worse" if high < 0 else "not told apart"
-        sides[side].append(experiment.labels[entry["method"]])
+        sides[SAYS[verdict(entry)]].append(experiment.labels[entry["method"]])
     return "; ".join(f"{side}: {', '.join(labels)}" for side, labels in sides.items() if labels)
 
 

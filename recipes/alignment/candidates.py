@@ -124,6 +124,11 @@ def make_candidates(
     data = check_data(data, store.provenance.num_rollouts)
     if data.kind == "expert":
         expert = _check_expert(data, store, expert)
+    elif expert is not None:
+        raise ValueError(
+            f"{expert.folder} holds rollouts of an expert, and method.data.kind={data.kind} reads none; leave expert "
+            "out, or say method=afd_expert."
+        )
     wanted = set(store.scenes.tolist() if among is None else among)
     rows = [row for row, scene in enumerate(store.scenes.tolist()) if scene in wanted]
     chosen = zip(rows, _choose(data, store, rows, seed), strict=True)
@@ -321,7 +326,7 @@ def _check(data: DictConfig, held: int, given: DictConfig) -> None:
     if data.kind == "ranking" and data.num is None:
         return
     for name in ("num", "num_unpreferred") if data.kind == "sets" else ("num",):
-        if not isinstance(data.get(name), int):
+        if type(data.get(name)) is not int:
             raise ValueError(
                 f"method.data.{name} must be a whole number, or a share between 0 and 1, got {data.get(name)!r}."
             )

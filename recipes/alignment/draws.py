@@ -43,6 +43,8 @@ def parts_of(
     drawn = [draw_rows(group, options.pairs_per_scene, draw) for group in groups]
     weights = [1 if group.unpreferred is not None else int(group.token_valid.sum()) for group in groups]
     mine = ranks.mine(range(len(groups)))
+    if not mine:  # scenes without tokens were left out; the other ranks wait for a pass of this one
+        yield make_batch(drawn[:1]).to(device), 0.0
     for part in micro_batches([_rows(drawn[i]) for i in mine], options.max_rows):
         share = sum(weights[mine[i]] for i in part) / max(1, sum(weights))
         yield make_batch([drawn[mine[i]] for i in part]).to(device), share

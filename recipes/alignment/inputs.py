@@ -109,7 +109,7 @@ class Inputs:
         """
         looks: list[Look | ImitationLook] = []
         if watch is not None:
-            looks.append(Look(watch, self.context, self.model, alignment))
+            looks.append(Look(watch, self.context, self.model, alignment, self.store.provenance))
         if SIDES[data.kind] == "targets" and self.store.provenance.num_rollouts > 1:
             looks.append(
                 ImitationLook(self.store, self.scenes, self.context, self.model, alignment, data.rank_by, self.learnt)

@@ -131,10 +131,16 @@ def _log_prob(logits: Tensor, tokens: Tensor, valid: Tensor) -> Tensor:
 def _sides(now: Tensor, valid: Tensor) -> dict[str, Tensor]:
     near, far = now.chunk(2)
     return {
-        "pair_accuracy": (near > far).double().mean(),
+        "pair_accuracy": _share_above(near, far, valid),
         "nll_preferred": -near.mean() / valid.sum(),
         "nll_unpreferred": -far.mean() / valid.sum(),
     }
+
+
+def _share_above(near: Tensor, far: Tensor, valid: Tensor, tie: float = 0.0) -> Tensor:
+    """Share of pairs whose first is larger, an equal one counted as ``tie``; NaN where no token counts."""
+    share = ((near > far).double() + tie * (near == far).double()).mean()
+    return share if valid.any() else torch.full_like(share, torch.nan)
 
 
 def _probed(model: MotionLM, reference: MotionLM, each: Probe, device: str) -> dict[str, float]:
@@ -145,7 +151,7 @@ def _probed(model: MotionLM, reference: MotionLM, each: Probe, device: str) -> d
     log_tokens, log_valid = (value[None, None].to(device) for value in (each.demonstration, each.demonstration_valid))
     log = token_log_prob(model(context, log_tokens, log_valid), log_tokens)
     found = _sides(now, valid) | {
-        "reward_accuracy": ((near_gain > far_gain).double() + (near_gain == far_gain).double() / 2).mean(),
+        "reward_accuracy": _share_above(near_gain, far_gain, valid, tie=0.5),
         "nll_demonstration": -log[log_valid].mean(),
         "entropy": _mean(token_entropy(logits), valid),
         "kl": _mean(token_divergence(logits, before), valid),

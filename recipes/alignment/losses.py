@@ -14,7 +14,8 @@ from dpa.losses import (
 )
 from dpa.policy import MotionLM
 from envs import keys
-from recipes.alignment.candidates import SIDES
+from recipes.alignment.candidates import SIDES, num_candidates
+from recipes.alignment.draws import num_drawn
 from recipes.common.cli import build
 
 LOSSES: dict[str, type[LossModule]] = {
@@ -36,12 +37,13 @@ def make_loss(section: DictConfig, model: MotionLM) -> LossModule:
     return build(LOSSES[section.kind], DictConfig(options), f"method.loss ({section.kind})", token_network(model))
 
 
-def check_fit(method: DictConfig, alignment: DictConfig) -> None:
+def check_fit(method: DictConfig, alignment: DictConfig, held: int) -> None:
     """Refuse a loss that would misread what the method learns from; a loss that has no ``sides`` takes anything.
 
     Args:
         method: ``data`` and ``loss``, from ``config/method``.
         alignment: the section, of which ``pairs_per_scene`` is read.
+        held: K, rollouts of a scene.
 
     Raises:
         ValueError: for instance a ranking loss for pairs, or for rankings of two.
@@ -52,11 +54,15 @@ def check_fit(method: DictConfig, alignment: DictConfig) -> None:
             "method.loss.credit=agent needs pairs that agents are ranked in one by one: method.data.kind=pairs and "
             f"rank_by={keys.DISTANCE}, got {data.kind} and {data.get('rank_by')}."
         )
-    if method.loss.kind == "plackett_luce" and alignment.pairs_per_scene < 2:
-        raise ValueError(
-            "method.loss.kind=plackett_luce ranks 2 * alignment.pairs_per_scene rollouts, and of two it is the loss of "
-            f"a pair; got alignment.pairs_per_scene={alignment.pairs_per_scene}, say for example 4, or method=dpo."
-        )
+    if method.loss.kind == "plackett_luce" and data.kind == "ranking":
+        ranked = sum(num_drawn(*num_candidates(data, held), alignment.pairs_per_scene))
+        if ranked < 3:
+            raise ValueError(
+                "method.loss.kind=plackett_luce ranks several rollouts, and of two it is the loss of a pair; "
+                f"method.data.num={data.num} of {held} rollouts and alignment.pairs_per_scene="
+                f"{alignment.pairs_per_scene} leave {ranked}; say method.data.num=null and "
+                "alignment.pairs_per_scene=4, or method=dpo."
+            )
     wanted = getattr(LOSSES.get(method.loss.kind), "sides", None)
     given = SIDES.get(method.data.kind)
     if wanted is None or given is None or given in FITS[wanted]:

@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 
 from dpa.losses.network import without_dropout
 from dpa.policy import ContextOptions, MotionLM
-from dpa.preferences import PreferenceStore
+from dpa.preferences import PreferenceStore, Provenance
 from envs.store import SceneStore
 from recipes.alignment.likelihoods import PROBED, SIDED, make_probes, probe, probe_sides
 from recipes.common.models import open_policy
@@ -43,13 +43,28 @@ class Look:
         context: how scenes are cut up.
         model: in training.
         options: the section ``alignment``.
+        learnt_from: origin of the rollouts that the training learns from.
 
     Raises:
-        ValueError: rollouts of other scenes than the tuning ones, or one of each alone.
+        ValueError: rollouts of other scenes than the tuning ones, in other tokens, or one of each alone.
     """
 
-    def __init__(self, watch: Watch, context: ContextOptions, model: MotionLM, options: DictConfig) -> None:
+    def __init__(
+        self,
+        watch: Watch,
+        context: ContextOptions,
+        model: MotionLM,
+        options: DictConfig,
+        learnt_from: Provenance,
+    ) -> None:
         store = open_ranked_scenes(watch.preferences, watch.scenes)
+        for name in ("tokenizer", "horizon"):
+            mine, other = getattr(learnt_from, name), getattr(store.provenance, name)
+            if mine != other:
+                raise ValueError(
+                    f"{store.folder} has {name} {other}, and the rollouts to learn from {mine}; let a policy of the "
+                    "same tokens roll the watched scenes out."
+                )
         if store.provenance.num_rollouts < 2:
             raise ValueError(
                 f"{store.folder} holds one rollout of each scene, and a pair needs two; collect again with "

@@ -160,12 +160,21 @@ def _members(values: list) -> Iterator[Any]:
         yield from _members(value) if isinstance(value, list) else [value]
 
 
+def is_number(value: Any) -> bool:
+    """Whether an option is a finite number; true and false are none.
+
+    Examples:
+        >>> [is_number(value) for value in (1, 0.5, float("nan"), True, "1")]
+        [True, True, False, False, False]
+    """
+    return type(value) is int or (type(value) is float and math.isfinite(value))
+
+
 def _misfit(value: Any, limit: Limit) -> str | None:
     """What the value should be, if it is not."""
     if value is None and limit.empty:
         return None
-    number = type(value) is int or (type(value) is float and math.isfinite(value))
-    if not (number if limit.kind is float else type(value) is limit.kind):
+    if not (is_number(value) if limit.kind is float else type(value) is limit.kind):
         return WORDS[limit.kind] + (" or null" if limit.empty else "")
     if limit.kind not in (int, float):
         return None

@@ -16,7 +16,7 @@ from recipes.alignment.candidates import check_data
 from recipes.alignment.losses import check_fit, make_loss
 from recipes.collect import check_collection
 from recipes.common.cli import check_steps, told_of
-from recipes.common.limits import GROUPS, check_limits
+from recipes.common.limits import GROUPS, check_limits, is_number
 from recipes.common.models import policy_config
 from recipes.common.rankings import build_distance, ranking_options
 from recipes.experiment.methods import read_setups
@@ -74,6 +74,9 @@ def _check_decodings(cfg: DictConfig) -> None:
                 f"decoding.{name} takes pairs [top-p, temperature], got {each!r}; say for example [0.95,1.0]."
             )
         Decoding(*each)
+    told = [f"[{top_p:g}, {temperature:g}]" for top_p, temperature in cfg.decoding.grid]  # as files are named by them
+    if twice := sorted({each for each in told if told.count(each) > 1}):
+        raise ValueError(f"decoding.grid has {twice[0]} more than once, got {told}; name each decoding once.")
     if list(cfg.decoding.common) not in [list(each) for each in cfg.decoding.grid]:
         raise ValueError(f"decoding.common={list(cfg.decoding.common)} must be one of decoding.grid.")
 
@@ -105,8 +108,14 @@ def _check_methods(cfg: DictConfig) -> None:
         if unknown := sorted(set(setup.alignment) - set(cfg.alignment)):
             raise ValueError(f"experiment.setup.{name}.alignment has no option {unknown[0]!r}.")
         alignment = setup.merged(cfg.alignment)
+        for part in ("data", "loss"):
+            if not OmegaConf.is_dict(cfg.methods[name].get(part)):
+                raise ValueError(
+                    f"methods.{name}.{part} must be a section with kind and its options, got "
+                    f"{cfg.methods[name].get(part)!r}; see the files of recipes/config/method."
+                )
         with told_of(f"methods.{name}"):
-            check_fit(cfg.methods[name], alignment)
+            check_fit(cfg.methods[name], alignment, cfg.collection.num_rollouts)
             check_data(cfg.methods[name].data, cfg.collection.num_rollouts)
             make_loss(cfg.methods[name].loss, model)
             check_steps(alignment, "alignment")
@@ -131,10 +140,28 @@ def _check_axis(cfg: DictConfig) -> None:
     for method, value in axis["values"].items():
         if method not in cfg.methods:
             raise ValueError(f"experiment.axis.values.{method} is no method; name one of {', '.join(cfg.methods)}.")
-        if isinstance(value, bool) or not isinstance(value, int | float):
+        if not is_number(value):
             raise ValueError(f"experiment.axis.values.{method} must be a number, got {value!r}.")
+        if axis["log"] is True and value <= 0:
+            raise ValueError(
+                f"experiment.axis.values.{method}={value} has no place on a logarithmic axis; say experiment.axis.log="
+                "false, or a positive number."
+            )
     if not isinstance(axis["name"], str) or not isinstance(axis["log"], bool):
         raise ValueError(f"experiment.axis: name must be text and log true or false, got {axis}.")
+
+
+def _check_published(experiment: DictConfig) -> None:
+    """The paper's figures are numbers by method and name."""
+    for method, figures in experiment.published.items():
+        if not OmegaConf.is_dict(figures):
+            raise ValueError(
+                f"experiment.published.{method} must hold figures by name, got {figures!r}; say for example "
+                "{realism: 0.739}."
+            )
+        for name, value in figures.items():
+            if not is_number(value):
+                raise ValueError(f"experiment.published.{method}.{name} must be a number, got {value!r}.")
 
 
 def _check_labels(cfg: DictConfig) -> None:
@@ -152,6 +179,7 @@ def _check_report(cfg: DictConfig) -> None:
     experiment = cfg.experiment
     _check_texts(experiment)
     _check_axis(cfg)
+    _check_published(experiment)
     if not re.fullmatch(r"\w[\w.-]*", str(experiment.name)):
         raise ValueError(
             f"experiment.name={experiment.name!r} names a file and a place on the page; say it in letters, digits, _, "

@@ -147,6 +147,26 @@ def test_seeds_and_files_that_are_not_there_are_told(tmp_path: Path) -> None:
         list(differences_of_files(mine, Path("nothing")))
 
 
+def test_likelihoods_are_no_evaluations(tmp_path: Path) -> None:
+    for name in ("mine", "base"):
+        content = {"options": {"seed": 0, "scenes": "a"}, "per_scene": {"kl": [0.1]}}
+        (tmp_path / f"{name}.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="mine.json is no evaluation .* its options lack evaluation, ranking"):
+        list(differences_of_files(tmp_path / "mine.json", tmp_path / "base.json"))
+
+
+@pytest.mark.parametrize("seeds", [1, 3])
+def test_the_table_of_one_training_run_says_so(
+    seeds: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    paths = [lay_out(tmp_path / name, name) for name in ("dpa_omf", "reference")]
+    given = [str(path / "10.json" if seeds == 1 else path) for path in paths]
+    monkeypatch.setattr(sys, "argv", ["difference", *given])
+    difference.main()
+    told = " ".join(capsys.readouterr().out.split())
+    assert ("one training run: intervals are over its scenes alone" in told) == (seeds == 1)
+
+
 def test_the_table_tells_what_is_certain_from_what_is_not(
     runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:

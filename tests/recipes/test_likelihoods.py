@@ -70,6 +70,14 @@ def test_a_log_without_tokens_has_no_likelihood() -> None:
     assert found["reward_accuracy"] == 0.5 and found["kl"] == 0, "what has learnt nothing gains nothing"
 
 
+def test_a_scene_without_tokens_ranks_nothing() -> None:
+    tokens, nothing = torch.zeros(1, 1, 2, dtype=torch.int64), torch.zeros(1, 2, dtype=torch.bool)
+    asked = Probe(make_context(straight_road(1)), tokens[0], ~nothing, tokens, tokens + 1, nothing)
+    found = probe(Steady([0.4, 0.3, 0.2, 0.1]), Steady([0.4, 0.3, 0.2, 0.1]), [asked])[0]
+    unknown = {name for name, value in found.items() if math.isnan(value)}
+    assert unknown == {*SIDED, "reward_accuracy", "entropy", "kl"}
+
+
 @pytest.fixture(scope="module")
 def model() -> MotionLM:
     torch.manual_seed(0)

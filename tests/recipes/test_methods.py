@@ -69,6 +69,28 @@ def test_a_method_comes_after_those_that_it_starts_from_or_learns_from() -> None
         ),
         (("alignment.steps=60",), r"needs a snapshot before step 60 and alignment.snapshots is \[75\]"),
         (("decoding.common=[0.5,1.0]",), r"decoding.common=\[0.5, 1.0\] must be one of decoding.grid"),
+        (
+            ("decoding.grid=[[0.95,1.0],[0.9,1.0],[0.9000001,1.0]]",),
+            r"decoding.grid has \[0.9, 1\] more than once, got .*; name each decoding once",
+        ),
+        (
+            ("experiment.published.dpa_omf.realism=abc",),
+            "experiment.published.dpa_omf.realism must be a number, got 'abc'",
+        ),
+        (
+            ("experiment.published={dpa_omf:3}",),
+            "experiment.published.dpa_omf must hold figures by name, got 3; say for example {realism: 0.739}",
+        ),
+        (("methods.dpa_omf.loss=null",), "methods.dpa_omf.loss must be a section with kind and its options, got None"),
+        (("methods.sft_best_oa.data.num=true",), "method.data.num must be a whole number, or a share .* got True"),
+        (
+            ("experiment=scaling", "experiment.axis.values.omf_r1=0"),
+            "experiment.axis.values.omf_r1=0 has no place on a logarithmic axis",
+        ),
+        (
+            ("experiment=losses", "methods.listwise.data.num=2"),
+            "methods.listwise: .*plackett_luce ranks several rollouts.*method.data.num=2 of 32 rollouts and .* leave 2",
+        ),
         (("decoding.grid=[0.95,0.85]",), r"decoding.grid takes pairs \[top-p, temperature\], got 0.95"),
         (("decoding.grid=[[0.95,1.0],[1.5,1.0]]",), r"top_p must lie in \(0, 1\], got 1.5"),
         (("seeds=[0,0]",), r"seeds must be one or more, each once, got \[0, 0\]"),

@@ -30,6 +30,7 @@ from dpa.realism.submission import validate
 from dpa.tokens import VerletTokenizer
 from dpa.training.batches import LogReader
 from dpa.training.checkpoint import load_policy
+from dpa.training.distributed import Ranks
 from dpa.training.loggers import read_curve
 from dpa.training.optim import accumulate_gradients, clip_and_step
 from envs import keys
@@ -522,7 +523,7 @@ def test_the_loss_of_every_method_can_be_built_and_reads_its_data(method: str) -
         cfg = compose("align", [f"method={method}", "alignment.pairs_per_scene=2"])
     section = cfg.method
     assert section.name == method
-    check_fit(section, cfg.alignment)
+    check_fit(section, cfg.alignment, held=32)
     loss = make_loss(section.loss, MotionLM("nano", VerletTokenizer()))
     given = {key for key in section.loss if key != "kind"}
     assert given == set(inspect.signature(type(loss)).parameters) - {"actor_network"}, "the YAML shows every option"
@@ -543,14 +544,50 @@ def test_a_loss_that_would_misread_the_data_is_refused(loss: str, data: str, mes
         check_fit(
             OmegaConf.create({"loss": {"kind": loss}, "data": {"kind": data}}),
             OmegaConf.create({"pairs_per_scene": 2}),
+            held=32,
         )
 
 
-def test_a_ranking_of_two_is_refused_before_anything_is_read(run: Callable, options: Callable, tmp_path: Path) -> None:
-    given = ["method=listwise", f"policy={tmp_path}/none", f"preferences={tmp_path}/none", f"output={tmp_path / 'run'}"]
-    outcome = run("align", *options("align", *given))
-    assert outcome.status == 2 and "got alignment.pairs_per_scene=1, say for example 4" in outcome.err
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (["method.data.num=null", "alignment.pairs_per_scene=1"], "method.data.num=None of 4 rollouts and"),
+        (["method.data.num=2", "alignment.pairs_per_scene=4"], "alignment.pairs_per_scene=4 leave 2; say"),
+        (["method.data.num=0.5", "alignment.pairs_per_scene=4"], "method.data.num=0.5 of 4 rollouts and"),
+    ],
+)
+def test_a_ranking_of_two_is_refused_before_a_step(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path, given: list[str], told: str
+) -> None:
+    given = [*given, f"policy={runs / 'reference/policy.pt'}", f"preferences={runs / 'preferences'}"]
+    outcome = run("align", *options("align", "method=listwise", *given, f"output={tmp_path / 'run'}"))
+    assert outcome.status == 2 and told in outcome.err
     assert not (tmp_path / "run").exists()
+
+
+def test_rollouts_of_an_expert_that_a_method_does_not_read_are_refused(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path
+) -> None:
+    command = watched(runs, options, tmp_path / "run", f"expert={runs / 'preferences'}")
+    outcome = run("align", *command)
+    assert outcome.status == 2
+    assert "preferences holds rollouts of an expert, and method.data.kind=pairs reads none; leave expert" in outcome.err
+
+
+def test_watched_rollouts_in_other_tokens_are_refused(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path
+) -> None:
+    tuned = tmp_path / "tuned"
+    assert run("collect", *collect_into(tuned, runs, options), "split=tune").status == 0
+    origin = tuned / "metadata.json"
+    content = json.loads(origin.read_text())
+    content["tokenizer"]["bins"] = "other"
+    origin.write_text(json.dumps(content))
+    for piece in tuned.glob("*.groups"):  # of the store as it was
+        piece.unlink()
+    outcome = run("align", *watched(runs, options, tmp_path / "run", f"watch={tuned}"))
+    assert outcome.status == 2
+    assert f"{tuned} has tokenizer" in outcome.err and "let a policy of the same tokens roll" in outcome.err
 
 
 def watched(runs: Path, options: Callable, folder: Path, *more: str) -> list[str]:
@@ -790,6 +827,17 @@ def test_a_step_is_the_same_however_it_is_split_into_parts() -> None:
         for mine, whole in zip(split, parts[2], strict=True):
             torch.testing.assert_close(mine, whole, atol=1e-5, rtol=1e-3)
     assert parts[2][2] > 1e-3 and parts[2][3].norm() > 1e-3
+
+
+def test_a_rank_without_a_scene_passes_one_that_does_not_count() -> None:
+    groups, options = [group_of(2)], OmegaConf.create({"pairs_per_scene": 2, "max_rows": 4})
+    shares = []
+    for rank in range(2):
+        draw = torch.Generator().manual_seed(0)
+        parts = list(parts_of(groups, options, draw, "cpu", Ranks(rank=rank, world_size=2)))
+        shares.append([share for _, share in parts])
+        assert parts[0][0]["preferred"].shape == (1, 2, 2, 16)
+    assert shares == [[1.0], [0.0]]
 
 
 def group_of(num_agents: int) -> Group:

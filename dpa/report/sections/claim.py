@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dpa.report.experiment import SAMPLED, Experiment, decoding_against, decoding_of, in_words
-from dpa.report.findings import differences_of, headline, reservations
+from dpa.report.findings import differences_of, headline, reservations, verdict
 from dpa.report.markup import Html, element, hint, joined
 from dpa.report.study import Study
 from dpa.report.table import signed
@@ -46,11 +46,10 @@ def _card(experiment: Experiment, title: str, entry: Mapping[str, Any] | None) -
         return Html("")
     low, high = entry["ci95"]
     seeds = f"{entry['n_seeds']} seed{'s' if entry['n_seeds'] > 1 else ''}"
-    kind = "better" if low > 0 else "worse" if high < 0 else "open"
     return element(
         "div",
         element("div", title, class_="card-title"),
-        element("div", signed(entry["realism_difference"]), class_=f"figure {kind}"),
+        element("div", signed(entry["realism_difference"]), class_=f"figure {verdict(entry)}"),
         element("div", f"[{signed(low)}, {signed(high)}] realism, 95 %"),
         element(
             "div",

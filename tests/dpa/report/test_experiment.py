@@ -64,6 +64,11 @@ def entry(name: str, **changes: Any) -> Broken:
         (lambda c: c["steps"]["common"].pop("dpa_omf"), r"steps\.common has no dpa_omf"),
         (lambda c: c["labels"].pop("dpa_omf@20"), r"labels has no entry for 'dpa_omf@20'"),
         (lambda c: c["labels"].update(dpa_omf=3e-4), r"labels\.dpa_omf must be str, got 0\.0003"),
+        (
+            lambda c: c["published"].update(dpa_omf={"realism": "abc"}),
+            r"published\.dpa_omf\.realism must be a number, got 'abc'",
+        ),
+        (lambda c: c["published"].update(dpa_omf=3), r"published\.dpa_omf must be a table of named values, got 3"),
         (lambda c: c["budget"]["dpa_omf"].update(start="x"), r"labels has no entry for 'x'"),
         (lambda c: c["budget"].update(dpa_omf={}), r"budget\.dpa_omf has no steps, rollouts, start"),
         (lambda c: c.update(split="train"), r"split must be one of eval, tune, got 'train'"),

@@ -10,6 +10,8 @@ import pytest
 
 from dpa.report.experiment import Comparison, Experiment, in_words, read_experiment
 from dpa.report.findings import budgets, headline, ordering, reservations
+from dpa.report.sections.claim import claim
+from dpa.report.study import read_study
 
 
 @pytest.fixture(scope="module")
@@ -121,6 +123,18 @@ def test_methods_are_sorted_by_what_can_be_told_of_them_against_the_headlines(fo
     versus = [{**entry, "ci95": ends[entry["method"]]} for entry in found.own_best.versus]
     own = dataclasses.replace(found.own_best, versus=versus)
     assert ordering(dataclasses.replace(found, own_best=own)) == "better: adversarial AFD; not told apart: DPA-ADEF"
+    once = dataclasses.replace(own, versus=[{**entry, "over": "scenes"} for entry in versus])
+    told = ordering(dataclasses.replace(found, own_best=once))
+    assert told == "not told apart: DPA-ADEF, adversarial AFD", "one training run says nothing about a method"
+
+
+@pytest.mark.parametrize(("over", "kind"), [("seeds and scenes", "better"), ("scenes", "open")])
+def test_a_card_has_the_colour_of_a_gain_where_one_is_claimed(
+    runs: Path, found: Experiment, over: str, kind: str
+) -> None:
+    found = with_difference(found, realism_difference=0.018, ci95=[0.006, 0.03], over=over)
+    study = dataclasses.replace(read_study(runs), experiments={"methods": found})
+    assert f'class="figure {kind}">+0.018' in str(claim(study))
 
 
 def test_equal_budgets_are_not_spoken_of_and_others_are_grouped(found: Experiment) -> None:
