@@ -16,6 +16,7 @@ from dpa.policy import Decoding
 from envs.files import write_json
 from recipes.common.cli import CONFIG
 from recipes.compare import choose, snapshots_of
+from recipes.experiment import jobs
 from recipes.experiment.check import check_experiment
 from recipes.experiment.jobs import runs_of
 from recipes.experiment.methods import drawing_seed, read_setups, setup_of
@@ -31,6 +32,56 @@ FURTHER = "+experiment.setup.dpa_omf={start:dpa_adef}"
 def configuration(*options: str) -> DictConfig:
     with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):
         return compose("compare", list(options))
+
+
+@pytest.mark.parametrize(
+    ("name", "method", "policy", "preferences", "expert", "changed"),
+    [
+        ("features", "dpa_omf", "reference", "preferences_train", None, {}),
+        ("features", "collision", "reference", "preferences_train_by_collision", None, {}),
+        ("rounds", "omf_round_2", "dpa_omf", "preferences_train_of_dpa_omf", None, {}),
+        ("rounds", "spin_round_2", "adversarial_afd", "preferences_train_of_adversarial_afd", None, {}),
+        ("rounds", "omf_thrice", "reference", "preferences_train", None, {"steps": 450}),
+        ("losses", "afd_expert", "reference", "preferences_train", "preferences_train_of_sft_best_oa", {}),
+        ("variants", "normalised_more_pairs", "reference", "preferences_train_by_normalised", None,
+         {"pairs_per_scene": 4}),
+        ("step_size", "sweep_3e4", "reference", "preferences_train", None, {"lr": 3e-4}),
+    ],
+)  # fmt: skip
+def test_a_method_is_aligned_with_what_its_experiment_says(
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    method: str,
+    policy: str,
+    preferences: str,
+    expert: str | None,
+    changed: dict[str, float],
+) -> None:
+    cfg, given = configuration(f"experiment={name}"), {}
+    monkeypatch.setattr(jobs, "open_splits", lambda _: SimpleNamespace(train=range(4), tune=range(2)))
+    monkeypatch.setattr(jobs, "seconds_trained", lambda _: 0.0)
+    monkeypatch.setattr(jobs, "align", lambda *args, **options: given.update(args=args, **options))
+    jobs.align_job(cfg, 3, method)
+    options, data_and_loss, _, start, store, _, folder = given["args"]
+    seed = runs_of(cfg).root / "seed_3"
+    assert (start, store, folder) == (seed / policy / "policy.pt", seed / preferences, seed / method)
+    assert given["expert"] == (None if expert is None else seed / expert)
+    assert data_and_loss == cfg.methods[method]
+    own = {key: value for key, value in options.alignment.items() if value != cfg.alignment[key]}
+    assert changed.items() <= own.items() and (changed or not own)
+    assert given["watch"].reference == seed / "reference/policy.pt", "drift is measured from the first one"
+
+
+def test_rollouts_are_ranked_again_by_the_distance_of_that_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    cfg, given = configuration("experiment=features"), []
+    monkeypatch.setattr(jobs, "open_splits", lambda _: SimpleNamespace(train="scenes"))
+    monkeypatch.setattr(jobs, "rerank", lambda *args: given.extend(args))
+    jobs.rerank_job(cfg, 3, "reference", "collision")
+    section, scenes, policy, store, made = given
+    seed = runs_of(cfg).root / "seed_3"
+    assert section.features == "collision" and section.stride == cfg.collection.ranking.stride and scenes == "scenes"
+    assert policy == seed / "reference/policy.pt"
+    assert (store, made) == (seed / "preferences_train", seed / "preferences_train_by_collision")
 
 
 @pytest.mark.parametrize("name", [name for name in EXPERIMENTS if name != "base"])
