@@ -690,10 +690,10 @@ def test_drift_is_measured_from_the_reference_also_in_a_second_round(
     assert run("align", *watched(runs, options, tmp_path / "first")).status == 0
     cfg = compose_recipe("align", options, runs)
     watch = Watch(open_splits(cfg.scenes).tune, tmp_path / "tuned", runs / "reference/policy.pt")
-    drift = {}
+    learnt_from, drift = PreferenceStore(runs / "preferences").provenance, {}
     for name in ("reference", "first"):
         model, context, _ = open_policy((tmp_path if name == "first" else runs) / name / "policy.pt")
-        drift[name] = Look(watch, context, model, cfg.alignment)("cpu")["tune/kl"]
+        drift[name] = Look(watch, context, model, cfg.alignment, learnt_from)("cpu")["tune/kl"]
     assert drift["reference"] == pytest.approx(0, abs=1e-7) and drift["first"] > 1e-5
 
 
