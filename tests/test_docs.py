@@ -38,7 +38,6 @@ from recipes import validity
 from recipes.alignment.losses import LOSSES
 from recipes.benchmark.__main__ import make_parser as benchmark_parser
 from recipes.common.models import TOKENIZERS
-from recipes.difference import differences_of_files
 from recipes.difference import make_parser as difference_parser
 from recipes.plan import make_parser as plan_parser
 from recipes.report import make_parser as report_parser
@@ -270,7 +269,7 @@ def test_pictures_of_the_documents_are_small() -> None:
 
 
 SPLITS = ("train", "tune", "eval")
-WITH_SAFETY = {FIRST, "variants", "losses", "rounds"}
+WITH_SAFETY = {FIRST, "fresh", "variants", "losses", "rounds"}
 """Experiments whose table of safety the page of results has."""
 SHOWN = ("kinematic", "interactive", "map_based", "realism", "collision_rate", "offroad_rate")
 """Measures in README's table."""
@@ -289,7 +288,7 @@ def test_the_tables_of_the_results_are_those_of_the_studies_beside_them(study: S
     evaluations = Evaluations(study.folder)
     for experiment in study.experiments.values():
         one = set(experiment.chosen.values()) == {experiment.common}  # decoding: both tables would say the same
-        learnt = who_learns(experiment, evaluations) if experiment.name == FIRST else None
+        learnt = who_learns(experiment, evaluations) if experiment.name in (FIRST, "fresh") else None
         tables = [
             comparison_table(experiment, experiment.own_best),
             None if one else comparison_table(experiment, experiment.at_common),
@@ -315,43 +314,17 @@ def test_the_policies_of_the_page_of_safety_are_those_of_the_study_beside_the_re
         assert len(scenes) == 5 and f"| {label} | {' | '.join(cells)} | |" in text
 
 
-@pytest.mark.parametrize("study", [path for path in STUDIES if path.stem == "sumo"], indirect=True)
+@pytest.mark.parametrize("study", [path for path in STUDIES if path.stem == "fresh"], indirect=True)
 def test_the_table_of_the_readme_is_that_of_the_study_beside_the_results(study: Study) -> None:
     text = (REPOSITORY / "README.md").read_text(encoding="utf-8")
     rows = [[cell.strip(" *") for cell in line.strip("|").split("|")] for line in text.splitlines() if "|" in line]
     told = {cells[0]: cells[1:8] for cells in rows if len(cells) == 9}
-    shown = dict.fromkeys(study.experiments["methods"].methods, "methods") | {"normalised_more_pairs": "variants"}
-    for method, name in shown.items():
-        experiment = study.experiments[name]
-        of = next(record for record in experiment.own_best.records() if record["method"] == method)
-        entry = experiment.own_best.entry(method)
+    experiment = study.experiments["fresh"]
+    for record in experiment.own_best.records():
+        entry = experiment.own_best.entry(record["method"])
         change = "–" if entry is None else difference(entry["realism_difference"], entry["ci95"])
-        label = "a variant: two changes" if name == "variants" else experiment.labels[method]
-        assert told[label] == [*(number(of[key], 3) for key in SHOWN), change], label
-
-
-@pytest.mark.parametrize(
-    ("other", "label"),
-    [("top_p_0.9_t_1.0", "top-p 0.9, the reference's best of four"), ("top_p_0.95_t_1.0", "top-p 0.95")],
-)
-def test_the_table_of_a_lower_temperature_is_that_of_the_evaluations_beside_it(
-    other: str, label: str, tmp_path: Path
-) -> None:
-    zipfile.ZipFile(REPOSITORY / "docs/studies/evaluations/reference_sumo.zip").extractall(tmp_path)
-    found = {
-        each.measure: each.interval for each in differences_of_files(tmp_path / "top_p_0.95_t_0.8", tmp_path / other)
-    }
-    cells = [label]
-    for measure, digits, scale in (
-        ("realism", 3, 1),
-        ("map_based", 3, 1),
-        ("collision_rate", 1, 100),
-        ("spread", 2, 1),
-    ):
-        mean, low, high = (scale * end for end in (found[measure].mean, found[measure].low, found[measure].high))
-        cells.append(in_a_cell({"mean": mean, "ci95": (low, high)}, digits))
-        assert found[measure].num_seeds == 5
-    assert f"| {' | '.join(cells)} |" in (REPOSITORY / "docs" / "results.md").read_text(encoding="utf-8")
+        label = experiment.labels[record["method"]]
+        assert told[label] == [*(number(record[key], 3) for key in SHOWN), change], label
 
 
 @pytest.mark.parametrize("study", [path for path in STUDIES if path.stem == "drift"], indirect=True)
