@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import hydra
 from omegaconf import DictConfig
@@ -122,11 +123,16 @@ def align(
                 snapshots.keep(done, model, inputs.config, described)
     if ranks.main:
         write_policy(path, model, inputs.config, described)
-        last = {name: finite(curve["value"][-1]) for name, curve in read_curves(folder).items()}
-        warned = {} if saturation.found is None else {SATURATED: saturation.found}
-        write_json(result, {"options": decided_by, "policy": str(path), "last_step": last, **warned})
+        write_result(result, path, decided_by, saturation)
     ranks.wait()
     return path
+
+
+def write_result(result: Path, policy: Path, decided_by: dict[str, Any], saturation: SaturationWatch) -> None:
+    """Say that a run is finished: what decided it, its last figures, and the warning where its loss saturated."""
+    last = {name: finite(curve["value"][-1]) for name, curve in read_curves(result.parent).items()}
+    warned = {} if saturation.found is None else {SATURATED: saturation.found}
+    write_json(result, {"options": decided_by, "policy": str(policy), "last_step": last, **warned})
 
 
 def tell(method: DictConfig, warning: str | None, ranks: Ranks) -> None:

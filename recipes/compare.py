@@ -58,11 +58,11 @@ def compare(cfg: DictConfig) -> dict[str, Any]:
     with alone_in(runs.root):
         write_scene_cards(runs.scenes, splits)
         with Workers(cfg.workers, cfg.threads, spread=cfg.device == "cuda") as workers:
-            stages = Stages(workers, runs.stages)
+            stages = Stages(workers, runs.stages, made)
             train_policies(cfg, stages)
             chosen = choose(cfg, stages)
             measure(cfg, stages, chosen)
-        found = summarise_experiment(cfg, splits, chosen, stages.seconds) | made
+        found = summarise_experiment(cfg, splits, chosen, stages.seconds) | made | stages.made
         path, pictures = runs.experiment(cfg.experiment.name), {}
         write_json(path, found)
         if cfg.pictures.scenes:

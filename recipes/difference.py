@@ -4,8 +4,9 @@
     python -m recipes.difference EVALUATION OTHER
 
 RUNS is the folder that recipes.compare fills (its output), or an archive of one, unpacked. Each method stands at its
-own best decoding, or at those that are given. EVALUATION is what recipes.evaluate writes, a JSON, or a folder with one
-for each seed. From the values of every scene: nothing is run.
+own best decoding, or at those that are given. OTHER may be of another experiment of the same folder, NAME:METHOD.
+EVALUATION is what recipes.evaluate writes, a JSON, or a folder with one for each seed. From the values of every scene:
+nothing is run.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from dpa.report.experiment import Decoding, Experiment, decoding_of, in_words, r
 from dpa.report.paired import Rows, paired_values
 from dpa.report.statistics import Interval, paired_bootstrap
 from dpa.report.study import Evaluations
+from dpa.report.table import print_whole
 from recipes.common.cli import refused
 
 COMPARED = ("scenes", "evaluation", "ranking")
@@ -47,30 +49,33 @@ class Difference(NamedTuple):
     ahead: int
 
 
-def differences(
-    experiment: Experiment, method: str, other: str, evaluations: Evaluations, at: Sequence[Decoding] = ()
-) -> Iterator[Difference]:
+class Side(NamedTuple):
+    """A method of an experiment."""
+
+    experiment: Experiment
+    method: str
+
+
+def differences(side: Side, other: Side, evaluations: Evaluations, at: Sequence[Decoding] = ()) -> Iterator[Difference]:
     """Every measure of an evaluation, and the likelihoods of the same policies, of one method minus another.
 
     Args:
-        experiment: that has both.
-        method: the one.
-        other: what it is compared with.
+        side: the one.
+        other: what it is compared with, of the same folder and scenes.
         evaluations: figures of every scene.
         at: decoding of both, or one of each; by default each at its own best.
 
     Raises:
-        ValueError: a method, or a decoding of it, that was not evaluated (the message names those that were), or a file
-            of values that is not there.
+        ValueError: a method, or a decoding of it, that was not evaluated (the message names those that were), a file of
+            values that is not there, or values of other scenes.
     """
-    own = (experiment.chosen.get(method), experiment.chosen.get(other))
+    both = (side, other)
+    own = tuple(experiment.chosen.get(method) for experiment, method in both)
     decodings = {0: own, 1: (*at, *at), 2: at}[len(at)]
-    evaluated = [_rows(experiment, *side) for side in zip((method, other), decodings, strict=True)]
+    evaluated = [_rows(*each, decoding) for each, decoding in zip(both, decodings, strict=True)]
     for rows in evaluated:
         _check_files(rows, evaluations)
-    policies = {Path(row["file"]).parent for rows in evaluated for row in rows}  # a method may have several checkpoints
-    kept = [row for row in experiment.likelihood if Path(row["file"]).parent in policies]
-    likely = [[row for row in kept if row["method"] == name] for name in (method, other)]
+    likely = [_likely(*each, rows) for each, rows in zip(both, evaluated, strict=True)]
     for mine, base in (evaluated, likely):
         yield from _measures(mine, base, evaluations)
 
@@ -158,6 +163,12 @@ def _rows(experiment: Experiment, method: str, decoding: Decoding | None) -> Row
     return [found[seed] for seed in sorted(found)]
 
 
+def _likely(experiment: Experiment, method: str, rows: Rows) -> Rows:
+    """Rows of likelihood of the same policies: a method may have several checkpoints."""
+    policies = {Path(row["file"]).parent for row in rows}
+    return [row for row in experiment.likelihood if row["method"] == method and Path(row["file"]).parent in policies]
+
+
 def _check_files(rows: Rows, evaluations: Evaluations) -> None:
     lost = next((row["file"] for row in rows if evaluations(row["file"]) is None), None)
     if lost is not None:
@@ -188,7 +199,13 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("runs", metavar="RUNS", type=Path, help="folder of results, or an evaluation")
     parser.add_argument("experiment", metavar="EXPERIMENT", help="name of it, such as methods, or another evaluation")
     parser.add_argument("method", metavar="METHOD", nargs="?", help="such as dpa_omf; none with two evaluations")
-    parser.add_argument("other", metavar="OTHER", nargs="?", default="reference", help="by default the reference")
+    parser.add_argument(
+        "other",
+        metavar="OTHER",
+        nargs="?",
+        default="reference",
+        help="by default the reference; NAME:METHOD of another experiment",
+    )
     parser.add_argument(
         "--at", metavar="TOP_P,T", type=decoding, nargs="+", default=[], help="decoding of both, or one of each"
     )
@@ -215,13 +232,22 @@ def main() -> None:
 
 
 def _of_experiment(given: argparse.Namespace) -> Iterator[Difference]:
-    path = given.runs / "experiments" / f"{given.experiment}.json"
-    if not path.is_file():
-        known = ", ".join(sorted(each.stem for each in path.parent.glob("*.json"))) or "none"
-        raise ValueError(f"{given.runs} has no experiment {given.experiment!r}; it has {known}.")
     if len(given.at) > 2:
         raise ValueError(f"--at takes one decoding for both, or one of each, got {len(given.at)}.")
-    return differences(read_experiment(path), given.method, given.other, Evaluations(given.runs), given.at)
+    name, _, other = given.other.rpartition(":")
+    sides = (
+        Side(_read(given.runs, given.experiment), given.method),
+        Side(_read(given.runs, name or given.experiment), other),
+    )
+    return differences(*sides, Evaluations(given.runs), given.at)
+
+
+def _read(runs: Path, name: str) -> Experiment:
+    path = runs / "experiments" / f"{name}.json"
+    if not path.is_file():
+        known = ", ".join(sorted(each.stem for each in path.parent.glob("*.json"))) or "none"
+        raise ValueError(f"{runs} has no experiment {name!r}; it has {known}.")
+    return read_experiment(path)
 
 
 def _print(found: Sequence[Difference], method: str, other: str) -> None:
@@ -229,14 +255,14 @@ def _print(found: Sequence[Difference], method: str, other: str) -> None:
     told = "; one training run: intervals are over its scenes alone and carry no claim about a method" if one else ""
     table = Table(title=f"{method} minus {other}{told}", title_justify="left")
     for title in ("measure", method, other, "difference [95 %]", "higher in seeds", "scenes"):
-        table.add_column(title, justify="left" if title == "measure" else "right")
+        table.add_column(title, justify="left" if title == "measure" else "right", no_wrap=True)
     for each in found:
         between = each.interval
         change = f"{between.mean:+.4f} [{between.low:+.4f}, {between.high:+.4f}]"
         seeds = f"{each.ahead} of {between.num_seeds}"
         numbers = (f"{each.mine:.4f}", f"{each.other:.4f}", change, seeds, str(between.num_scenes))
-        table.add_row(each.measure, *numbers, style="bold" if between.excludes_zero and not one else None)
-    Console(width=120).print(table)
+        table.add_row(each.measure, *numbers, style=None if between.verdict == "open" else "bold")
+    print_whole(table, Console())
 
 
 if __name__ == "__main__":

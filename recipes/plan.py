@@ -27,6 +27,9 @@ STEPS = 80
 SCORED_ROLLOUTS = 32
 """Of each scene in an evaluation (the WOSAC standard)."""
 
+ALIGNED = 4 / 3
+"""An aligned rollout over a trained log: loss and gradients are about three passes, the reference's likelihood one."""
+
 
 class Part(NamedTuple):
     """One stage of the method.
@@ -116,10 +119,10 @@ def make_plan(rates: dict[str, float], memory: dict[str, float], options: argpar
         ),
         Part(
             "align",
-            hours(2 * options.alignment_steps * options.alignment_pairs, "trained"),
+            hours(2 * ALIGNED * options.alignment_steps * options.alignment_pairs, "trained"),
             0.01,
             memory["trained"],
-            "updates x pairs x agents",
+            "updates x pairs x agents, the reference's likelihoods too",
         ),
         Part("evaluate, one process", evaluated, 0.1, memory["collector"], "scenes x agents"),
     ]

@@ -30,7 +30,9 @@ DIFFERENCES = "differences"
 """The figure that is drawn unless another one is named."""
 
 
-def report(runs: Path, out: Path, experiment: str | None = None, figure: str | None = None) -> Path:
+def report(
+    runs: Path, out: Path, experiment: str | None = None, figure: str | None = None, *, numbered: bool = False
+) -> Path:
     """Write the page of a study, the picture of an experiment, its tables, or what they rest on.
 
     Args:
@@ -38,6 +40,7 @@ def report(runs: Path, out: Path, experiment: str | None = None, figure: str | N
         out: ``.html``, a folder for ``index.html``, ``.png``, ``.md``, or ``.zip``.
         experiment: of the picture; by default the first that the page shows.
         figure: of the picture, ``differences`` or one of :data:`~dpa.report.stills.FIGURES`.
+        numbered: a ``.zip`` calls scenes by number.
 
     Returns:
         The file that was written.
@@ -54,6 +57,8 @@ def report(runs: Path, out: Path, experiment: str | None = None, figure: str | N
     for option, value in {"experiment": experiment, "figure": figure}.items():
         if value is not None and kind != ".png":
             raise ValueError(f"--{option}={value} is for a picture.png; {out.name or out} shows all of them.")
+    if numbered and kind != ".zip":
+        raise ValueError(f"--number-scenes is for results.zip; {out.name or out} shows scenes by their names.")
     if experiment is not None and experiment not in study.experiments:
         raise ValueError(f"{runs} has no experiment {experiment!r}; it has {', '.join(study.experiments)}.")
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -61,7 +66,7 @@ def report(runs: Path, out: Path, experiment: str | None = None, figure: str | N
         draw(study, experiment or next(iter(study.experiments)), figure or DIFFERENCES, out)
         return out
     if kind == ".zip":
-        return write_archive(out, runs)
+        return write_archive(out, runs, numbered=numbered)
     if kind == ".md":
         return write_whole(out, study_text(study))
     page = out if kind == ".html" else out / "index.html"
@@ -106,6 +111,7 @@ def make_parser() -> argparse.ArgumentParser:
         help="figure of picture.png: differences in realism (the default), realism over sharpness, figure 7 (scaling), "
         "figures 4 and 6 (likelihood), health of the alignment",
     )
+    parser.add_argument("--number-scenes", action="store_true", help="results.zip calls scenes by number, not by name")
     return parser
 
 
@@ -113,7 +119,7 @@ def main() -> None:
     """Entry point of ``python -m recipes.report``."""
     given = make_parser().parse_args()
     try:
-        print(report(given.runs, given.out, given.experiment, given.figure))
+        print(report(given.runs, given.out, given.experiment, given.figure, numbered=given.number_scenes))
     except (ValueError, OSError) as error:
         sys.exit(refused(error))
 

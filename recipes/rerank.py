@@ -39,7 +39,8 @@ def rerank(ranking: DictConfig, scenes: SceneStore, policy: Path, preferences: P
     store, distance = open_preferences(preferences, scenes, model, policy), build_distance(ranking, "ranking")
     provenance = replace(store.provenance, ranking=distance.describe())
     with PreferenceWriter(folder, provenance) as writer:
-        rows = [row for row, scene in enumerate(store.scenes.tolist()) if scene not in writer.scenes_done]
+        done = writer.scenes_done
+        rows = [row for row, scene in enumerate(store.scenes.tolist()) if scene not in done]
         bar = progress(total=len(store), description="rank", initial=len(store) - len(rows), unit="scene")
         with bar:
             for row, each in zip(rows, stored(store, rows, scenes, model, options), strict=True):

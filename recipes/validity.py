@@ -26,7 +26,17 @@ from envs.files import write_json
 from recipes.common.cli import CONFIG, finite, recipe
 from recipes.common.rolled import Rolled
 from recipes.common.scenes import open_splits
-from recipes.studies.study import ADE, RANDOM_GROUPS, as_json, distances_of, how_made, over_scenes, random_groups, study
+from recipes.studies.study import (
+    ADE,
+    RANDOM_GROUPS,
+    as_json,
+    distances_of,
+    how_made,
+    over_scenes,
+    random_groups,
+    study,
+    with_realism,
+)
 from recipes.studies.tables import StudyTable, tell
 
 
@@ -139,10 +149,8 @@ def compare_with(measured: dict[str, list[dict]], other: str) -> dict[str, dict[
 def _with_realism(measured: dict[str, list[dict]]) -> list[list[dict]]:
     """For each policy the scenes that have realism under all of them."""
     rows = list(measured.values())
-    kept = [i for i in range(len(rows[0])) if all(None not in row[i]["random"]["realism"] for row in rows)]
-    if not kept:
-        raise ValueError("no scene has realism: none scores all features of the metric; choose scenes with vehicles.")
-    return [[row[i] for i in kept] for row in rows]
+    places = with_realism(rows, lambda scene: scene["random"]["realism"])
+    return [[row[place] for place in places] for row in rows]
 
 
 @hydra.main(**CONFIG, config_name="validity")

@@ -138,6 +138,7 @@ class MotionActor(TensorDictModuleBase):
         # Of the method, so that the wrapper of a module is not registered beside the module.
         self._decode = torch.compile(model.decoder.forward) if compile else model.decoder.forward
         self._memory: SceneMemory | None = None
+        self._due: Tensor | None = None  # [B], the decision that each row takes next
         self._cache: NodeCache | None = None
         self.set_seed(seed)
 
@@ -156,6 +157,7 @@ class MotionActor(TensorDictModuleBase):
         """``[B, A, V]`` of the decision at hand; adds its nodes to the cache."""
         recent, step = tensordict[keys.RECENT], tensordict[keys.STEP][:, 0]
         self._start(tensordict)
+        self._due = step + 1
         controlled = tensordict[keys.CONTROLLED]
         last = torch.where((step[:, None] > 0) & controlled, self._last, self.model.no_token)
         valid = tensordict[keys.VALID]
@@ -179,6 +181,7 @@ class MotionActor(TensorDictModuleBase):
         if shape[0] % self.num_rollouts:
             raise ValueError(f"num_rollouts must divide the batch of {shape[0]} rows, got {self.num_rollouts}.")
         scene, begins = tensordict[keys.SCENE], step == 0
+        self._check_order(step)
         if (step == 1).any():
             self._count(scene, step)
         if not begins.any():
@@ -196,6 +199,14 @@ class MotionActor(TensorDictModuleBase):
         with self._autocast(step.device):
             self._memory = self.model.encode(context)
         self._draw_noise(begins.nonzero()[:, 0].tolist(), scene.tolist())
+
+    def _check_order(self, step: Tensor) -> None:
+        due = self._due if self._due is not None and self._due.shape == step.shape else torch.zeros_like(step)
+        if ((step > 0) & (step != due)).any():
+            raise ValueError(
+                f"decisions of a rollout must follow each other from 0 on, got {step.tolist()} where {due.tolist()} or "
+                "0 was due; reset the environment, and give each environment an actor of its own."
+            )
 
     def _check_agents(self, context: SceneContext, tensordict: TensorDictBase, begins: Tensor) -> None:
         """Refuse contexts of other agents than the environment's."""

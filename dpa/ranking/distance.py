@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dpa.ranking.displacement import average_displacement
 from dpa.ranking.features import feature_clips, feature_names, feature_weights, log_trajectory, occupancy_features
-from dpa.ranking.transport import deciding_options, make_solver, transport_cost
+from dpa.ranking.transport import Transport, deciding_options, make_solver, transport_cost
 from envs.scene import CURRENT_STEP, STEP_SECONDS, Scene
 
 AGGREGATES: dict[str, Callable[[Tensor], Tensor]] = {
@@ -49,6 +49,21 @@ class Ranking(NamedTuple):
     """``[R, D]``: share of each feature in the summed distance of the ranked agents, whatever the aggregate; rows sum
     to 1, or are 0 where that distance is 0. It tells which feature decides: units and clip ranges do more than weights.
     """
+
+
+class Coupled(NamedTuple):
+    """Occupancy measures of E agents in R rollouts and in the log, coupled; T' measured steps, D features."""
+
+    rollouts: Tensor
+    """``[R, E, T', D]`` features, clipped."""
+    log: Tensor
+    """``[E, T', D]``."""
+    valid: Tensor
+    """``[E, T']`` bool, of the log and so of the rollouts."""
+    weights: Tensor
+    """``[D]``."""
+    moved: Transport
+    """Of ``[R, E]`` problems."""
 
 
 class Distance(Protocol):
@@ -160,23 +175,12 @@ class PreferenceDistance:
             controlled: ``[A]`` bool; all of them by default.
         """
         ego = ranked_agents(scene, controlled, self.agents)
-        phi, log_phi, valid = self._features(scene, trajectories, ego)
-        weights = feature_weights(feature_names(self.features), self.weights)
-        moved = transport_cost(
-            phi,
-            log_phi,
-            valid,
-            valid,
-            weights,
-            method=self.method,
-            threads=self.threads,
-            step=self.stride * STEP_SECONDS,
-            **self.solver,
-        )
+        coupled = self.couple(scene, trajectories, ego, coupling=False)
+        logged, moved = coupled.valid.any(-1), coupled.moved
 
-        ego = ego[valid.any(-1)]
+        ego = ego[logged]
         agent_distance = trajectories.new_zeros(trajectories.shape[:2])
-        agent_distance[:, ego] = moved.distance[:, valid.any(-1)]
+        agent_distance[:, ego] = moved.distance[:, logged]
         agent_ranked = torch.zeros(trajectories.shape[1], dtype=torch.bool)
         agent_ranked[ego] = True
         if len(ego) == 0:
@@ -188,11 +192,42 @@ class PreferenceDistance:
         distance = AGGREGATES[self.aggregate](agent_distance[:, ego])
         return Ranking(distance, agent_distance, ade, agent_ranked, _shares(moved.parts))
 
-    def _features(self, scene: Scene, trajectories: Tensor, ego: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Features of the rollouts ``[R, E, T', D]``, of the log ``[1, E, T', D]``, and valid ``[E, T']``."""
+    def couple(
+        self, scene: Scene, trajectories: Tensor, ego: Tensor, *, coupling: bool = True, stride: int | None = None
+    ) -> Coupled:
+        """Transport agents of rollouts onto their log.
+
+        Args:
+            scene: an uncollated scene.
+            trajectories: ``[R, A, T, 4]`` as for a ranking.
+            ego: ``[E]`` int64, rows of the agents.
+            coupling: keep the couplings, not their cost alone.
+            stride: steps of 0.1 s between two measurements; by default that of the distance.
+
+        Examples:
+            >>> from envs.sources.synthetic import straight_road
+            >>> scene = straight_road(2)
+            >>> coupled = PreferenceDistance(stride=5).couple(scene, log_trajectory(scene, 80)[None], torch.arange(2))
+            >>> coupled.rollouts.shape, coupled.moved.coupling.shape
+            (torch.Size([1, 2, 16, 5]), torch.Size([1, 2, 16, 16]))
+        """
+        names, stride = feature_names(self.features), stride or self.stride
         both = torch.cat((trajectories, log_trajectory(scene, trajectories.shape[2])[None].to(trajectories)))
-        phi, valid = occupancy_features(scene, both, self.features, ego=ego, stride=self.stride, clips=self.clips)
-        return phi[:-1], phi[-1:], valid
+        phi, valid = occupancy_features(scene, both, names, ego=ego, stride=stride, clips=self.clips)
+        weights = feature_weights(names, self.weights)
+        moved = transport_cost(
+            phi[:-1],
+            phi[-1],
+            valid,
+            valid,
+            weights,
+            method=self.method,
+            coupling=coupling,
+            threads=self.threads,
+            step=stride * STEP_SECONDS,
+            **self.solver,
+        )
+        return Coupled(phi[:-1], phi[-1], valid, weights, moved)
 
 
 def check_options(distance: object, **known: Collection[str]) -> None:

@@ -21,7 +21,7 @@ EPOCH = (1980, 1, 1, 0, 0, 0)
 """Date of every entry, so that equal studies give equal files."""
 
 
-def write_archive(path: Path, folder: Path) -> Path:
+def write_archive(path: Path, folder: Path, *, numbered: bool = False) -> Path:
     """Pack the results of a study with the options, curves and scene-by-scene values behind them.
 
     Unpacked it is a folder of results like the one that it came from: tables, intervals and the page are made from it
@@ -30,6 +30,7 @@ def write_archive(path: Path, folder: Path) -> Path:
     Args:
         path: ``.zip`` to write, in a folder that is there; it appears whole or not at all.
         folder: of the study.
+        numbered: scenes are called by their place in their split, as where a licence covers what names recordings.
 
     Returns:
         ``path``.
@@ -45,10 +46,26 @@ def write_archive(path: Path, folder: Path) -> Path:
     """
     with whole(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
         for file in files_of(folder):
-            _add(archive, file.relative_to(folder).as_posix(), file.read_bytes())
+            content = file.read_bytes()
+            _add(archive, file.relative_to(folder).as_posix(), number_scenes(content) if numbered else content)
         if cards := {name: card.to_json() for name, card in read_preference_cards(folder).items()}:
             _add(archive, CARDS, json.dumps(cards, indent=1).encode())
     return path
+
+
+def number_scenes(content: bytes) -> bytes:
+    """A file of results with its list of scenes by number; any other content as it is.
+
+    Examples:
+        >>> number_scenes(b'{"scenes": ["a7c0", "91d2"], "per_scene": {}}')
+        b'{"scenes": ["scene 0", "scene 1"], "per_scene": {}}'
+        >>> number_scenes(b"1,0.5")
+        b'1,0.5'
+    """
+    found = json.loads(content) if content.startswith(b"{") else None
+    if not isinstance(found, dict) or not isinstance(found.get("scenes"), list):
+        return content
+    return json.dumps(found | {"scenes": [f"scene {place}" for place in range(len(found["scenes"]))]}).encode()
 
 
 def _add(archive: zipfile.ZipFile, name: str, content: bytes) -> None:

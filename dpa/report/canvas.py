@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from envs.files import whole
 
 INK, QUIET, RULE = "#3c4043", "#8b9096", "#e3e5e8"
-POSITIVE, NEGATIVE, NEUTRAL = "#2a78b5", "#d55e00", "#8b9096"
-"""Better than the reference, worse, and not told apart from it."""
+VERDICTS = {"better": "#2a78b5", "worse": "#d55e00", "open": "#8b9096"}
+"""Colours of what may be said of a difference; see :func:`dpa.report.statistics.verdict`."""
 CYCLE = ("#2a78b5", "#d55e00", "#009e73", "#b0509a", "#c79a1b", "#56b4e9", "#6b6b6b", "#000000")
 
 

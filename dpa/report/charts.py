@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import plotly.graph_objects as go
 
-from dpa.report.canvas import CYCLE, INK, NEGATIVE, NEUTRAL, POSITIVE, QUIET, RULE
+from dpa.report.canvas import CYCLE, INK, QUIET, RULE, VERDICTS
 from dpa.report.markup import Html, element, in_script, joined
 from dpa.report.table import REFERENCE, difference
 
@@ -48,18 +48,20 @@ class Difference(NamedTuple):
         mean: the difference.
         low: end of the 95 % interval.
         high: other end.
+        verdict: what may be said of it; see :func:`~dpa.report.statistics.verdict`.
         hover: what is told of it, line by line.
     """
 
     mean: float
     low: float
     high: float
+    verdict: str = "open"
     hover: Sequence[str] = ()
 
     @property
     def colour(self) -> str:
         """Better, worse, or not told apart."""
-        return POSITIVE if self.low > 0 else NEGATIVE if self.high < 0 else NEUTRAL
+        return VERDICTS[self.verdict]
 
     @property
     def text(self) -> str:
@@ -161,7 +163,7 @@ def forest(
             hovertext=hovers, hoverinfo="text",
         )  # fmt: skip
         # The legend tells kinds apart; a colour that means better or worse is not theirs.
-        shade = NEUTRAL if colours is None else colours[kind]
+        shade = VERDICTS["open"] if colours is None else colours[kind]
         figure.add_scatter(
             x=[None], y=[None], mode="markers", name=told, legendgroup=kind,
             marker=_dot(shade, hollow=bool(place) and colours is None),

@@ -17,8 +17,8 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpa.ranking import FEATURES, PreferenceDistance, log_trajectory, occupancy_features, transport_cost
-from dpa.ranking.features import feature_names, feature_weights
+from dpa.ranking import FEATURES, PreferenceDistance, transport_cost
+from dpa.ranking.features import feature_names
 from dpa.report.canvas import INK, QUIET, RULE, blank_figure, calm, save_figure
 from envs.render import View, box_corners, draw_map, frame_view, pose_tracks
 from envs.scene import CURRENT_STEP, STEP_SECONDS, AgentKind, Scene
@@ -86,28 +86,23 @@ def couple_agent(distance: PreferenceDistance, scene: Scene, trajectory: Tensor,
         >>> dict(zip(coupled.names, coupled.parts.tolist()))["speed"]
         2.4749
     """
-    names, stride = feature_names(distance.features), distance.stride
-    both = torch.stack((trajectory, log_trajectory(scene, trajectory.shape[1]).to(trajectory)))
-    ego = torch.tensor([agent])
-    phi, valid = occupancy_features(scene, both, names, ego=ego, stride=stride, clips=distance.clips)
-    (rollout, log), valid, weights = phi[:, 0], valid[0], feature_weights(names, distance.weights)
+    coupled = distance.couple(scene, trajectory[None], torch.tensor([agent]))
+    rollout, log, valid, weights = coupled.rollouts[0, 0], coupled.log[0], coupled.valid[0], coupled.weights
     if not valid.any():
         raise ValueError(f"agent {agent} of scene {scene.scene_id} has no valid step in the log; choose another agent.")
-    sides = (rollout, log, valid, valid, weights)
-    step = stride * STEP_SECONDS
-    moved = transport_cost(*sides, method=distance.method, coupling=True, step=step, **distance.solver)
+    moved, in_step = coupled.moved, transport_cost(rollout, log, valid, valid, weights, method="time_aligned")
     cost = (weights.double() * (rollout[:, None].double() - log.double()) ** 2).sum(-1).sqrt()
     return AgentCoupling(
-        names=names,
-        seconds=step * torch.arange(1, len(valid) + 1),
+        names=feature_names(distance.features),
+        seconds=distance.stride * STEP_SECONDS * torch.arange(1, len(valid) + 1),
         valid=valid,
         rollout=rollout,
         log=log,
         cost=torch.where(valid[:, None] & valid, cost, torch.nan),
-        coupling=moved.coupling,
-        parts=moved.parts,
+        coupling=moved.coupling[0, 0],
+        parts=moved.parts[0, 0],
         distance=float(moved.distance),
-        time_aligned=float(transport_cost(*sides, method="time_aligned").distance),
+        time_aligned=float(in_step.distance),
     )
 
 

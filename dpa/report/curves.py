@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+from dpa.training.loggers import complete_rows
 
 Curve = Mapping[str, Sequence[float]]
 """``{"step": [...], "value": [...]}``."""
@@ -21,7 +22,8 @@ def read_curves(folder: str | Path) -> dict[str, dict[str, list[float]]]:
         ``{name: {"step": [...], "value": [...]}}``, in order of name.
 
     Raises:
-        ValueError: no such folder, or a row that is not ``step,value``; the message names file and line.
+        ValueError: no such folder, or a row that is not ``step,value``; the message names file and line. A last row
+            that a kill cut short is left out.
     """
     scalars = Path(folder) / "scalars"
     if not scalars.is_dir():
@@ -29,13 +31,12 @@ def read_curves(folder: str | Path) -> dict[str, dict[str, list[float]]]:
     curves: dict[str, dict[str, list[float]]] = {}
     for file in sorted(scalars.rglob("*.csv")):
         curve: dict[str, list[float]] = {"step": [], "value": []}
-        with file.open(newline="") as rows:
-            for line, row in enumerate(csv.reader(rows), start=1):
-                try:
-                    step, value = row
-                    curve["step"].append(int(step))
-                    curve["value"].append(float(value))
-                except ValueError as error:
-                    raise ValueError(f"{file}:{line}: expected 'step,value', got {','.join(row)!r}.") from error
+        for line, row in enumerate(complete_rows(file), start=1):
+            try:
+                step, value = row
+                curve["step"].append(int(step))
+                curve["value"].append(float(value))
+            except ValueError as error:
+                raise ValueError(f"{file}:{line}: expected 'step,value', got {','.join(row)!r}.") from error
         curves[file.relative_to(scalars).with_suffix("").as_posix()] = curve
     return curves

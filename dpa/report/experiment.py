@@ -22,6 +22,7 @@ PAIRED = {
 }  # fmt: skip
 LIKELIHOOD = {"method": str, "seed": int, "file": str}
 BUDGET = {"steps": int, "rollouts": int, "start": str}
+AXIS = {"name": str, "values": dict, "log": bool}
 SPLITS = {"train": "training", "tune": "tuning", "eval": "evaluation"}
 """What the scenes of a split are called."""
 SAMPLED = {"own best": "each at its own best decoding", "common": "all at the common decoding"}
@@ -157,6 +158,11 @@ class Experiment:
         """The scenes that the numbers are of, such as ``54 evaluation scenes``."""
         return f"{self.scenes[self.split]} {SPLITS[self.split]} scenes"
 
+    @property
+    def num_rollouts(self) -> int:
+        """Rollouts of each scene behind the numbers: of the tuning scenes those by which decodings are chosen."""
+        return self.config["decoding" if self.split == "tune" else "evaluation"]["num_rollouts"]
+
     def comparisons(self) -> dict[str, Comparison]:
         """What to show, by how methods were sampled; one comparison where all had one decoding: both are that one."""
         rows = (*self.at_common.rows, *self.own_best.rows)
@@ -248,13 +254,16 @@ def read_experiment(path: str | Path) -> Experiment:
     _check(content["own_best"], {"rows": list, "paired": list, "versus": list}, f"{path}: own_best")
     _check(content["steps"], {"common": dict, "own_best": dict}, f"{path}: steps")
     _check(content["scenes"], {**dict.fromkeys(SPLITS, int), "source": str}, f"{path}: scenes")
+    for part in ("decoding", "evaluation"):
+        _check(content["config"].get(part), {"num_rollouts": int}, f"{path}: config.{part}")
     for method, budget in content["budget"].items():
         _check(budget, BUDGET, f"{path}: budget.{method}")
     _check_names(content, path)
     _check_lists(content, path)
     axis = content["axis"]
     if axis is not None:
-        _check(axis, {"name": str, "values": dict, "log": bool}, f"{path}: axis")
+        _check(axis, AXIS, f"{path}: axis")
+    _check(content["chosen"], dict.fromkeys(content["methods"], list), f"{path}: chosen")
     for method, decoding in [("common", content["common"]), *content["chosen"].items()]:
         if len(decoding) != 2 or not all(isinstance(part, NUMBER) for part in decoding):
             raise ValueError(f"{path}: the decoding of {method} must be [top_p, temperature], got {decoding!r}.")
@@ -267,7 +276,7 @@ def read_experiment(path: str | Path) -> Experiment:
         chosen={method: _decoding(decoding) for method, decoding in content["chosen"].items()},
         at_common=Comparison(content["rows"], content["paired"], steps=content["steps"]["common"]),
         own_best=Comparison(own["rows"], own["paired"], own["versus"], content["steps"]["own_best"]),
-        axis=None if axis is None else Axis(**axis),
+        axis=None if axis is None else Axis(**{name: axis[name] for name in AXIS}),
         **made,
     )
 

@@ -8,8 +8,9 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-from dpa.report.canvas import CYCLE, INK, NEGATIVE, NEUTRAL, POSITIVE, QUIET, blank_figure, calm, save_figure
+from dpa.report.canvas import CYCLE, INK, QUIET, VERDICTS, blank_figure, calm, save_figure
 from dpa.report.experiment import Experiment, decoding_of, in_words
+from dpa.report.statistics import verdict
 from dpa.report.table import REFERENCE, difference
 
 BUCKETS = (("kinematic", "kinematic"), ("interactive", "interactive"), ("map_based", "map"))
@@ -18,7 +19,7 @@ BUCKETS = (("kinematic", "kinematic"), ("interactive", "interactive"), ("map_bas
 def plot_comparison(experiment: Experiment, path: str | Path) -> None:
     """Draw paired realism differences with their intervals, and beside them the three buckets of every method.
 
-    Each method stands at its own best decoding. A difference whose interval contains zero is grey: no claim. In the
+    Each method stands at its own best decoding. A difference of which nothing may be said is grey. In the
     buckets a small dot is a seed, a large one the mean over seeds, and the line marks the reference.
 
     Args:
@@ -52,7 +53,7 @@ def _forest(axes: Axes, records: list[dict[str, Any]]) -> None:
         if record["ci95"] is None:
             continue
         mean, (low, high) = record["realism_difference"], record["ci95"]
-        color = POSITIVE if low > 0 else NEGATIVE if high < 0 else NEUTRAL
+        color = VERDICTS[verdict(record["ci95"], record["over"])]
         axes.plot([low, high], [row, row], color=color, lw=2.2, solid_capstyle="round", zorder=2)
         axes.plot(mean, row, "o", color=color, ms=7, mec="white", mew=1, zorder=3)
         text = difference(mean, record["ci95"])

@@ -9,7 +9,7 @@ from typing import Any
 from dpa.losses.saturation import WATCHED, SaturationWatch
 from dpa.report.curves import read_curves
 from dpa.report.experiment import Decoding, Experiment, decoding_of, in_words, read_json
-from dpa.report.statistics import SCENES
+from dpa.report.statistics import SCENES, verdict
 from dpa.report.table import REFERENCE, signed
 
 FEW_SEEDS = 5
@@ -18,22 +18,6 @@ FEW_SEEDS = 5
 
 SAYS = {"better": "better", "worse": "worse", "open": "not told apart"}
 """Verdicts in words."""
-
-
-def verdict(entry: Mapping[str, Any]) -> str:
-    """``better``, ``worse`` or ``open``: what a paired difference allows to be said; of one training run, nothing.
-
-    Args:
-        entry: with ``ci95`` and ``over``.
-
-    Examples:
-        >>> [verdict({"ci95": [0.01, 0.02], "over": over}) for over in ("seeds and scenes", "scenes")]
-        ['better', 'open']
-    """
-    low, high = entry["ci95"]
-    if entry["over"] == SCENES:
-        return "open"
-    return "better" if low > 0 else "worse" if high < 0 else "open"
 
 
 def headline(experiment: Experiment) -> str:
@@ -76,7 +60,7 @@ def reservations(experiment: Experiment, num_compared: int | None = None) -> lis
     own = experiment.own_best
     entry = own.entry(experiment.headline)
     notes = []
-    if entry is not None and entry["over"] == "scenes":
+    if entry is not None and entry["over"] == SCENES:
         notes.append(
             "One training run: the interval covers the choice of scenes, not the spread between training runs."
         )
@@ -185,7 +169,7 @@ def ordering(experiment: Experiment) -> str:
     """Which methods can be told apart from ``experiment.versus``, each at its own best decoding."""
     sides: dict[str, list[str]] = {"better": [], "worse": [], "not told apart": []}
     for entry in experiment.own_best.versus:
-        sides[SAYS[verdict(entry)]].append(experiment.labels[entry["method"]])
+        sides[SAYS[verdict(entry["ci95"], entry["over"])]].append(experiment.labels[entry["method"]])
     return "; ".join(f"{side}: {', '.join(labels)}" for side, labels in sides.items() if labels)
 
 

@@ -12,11 +12,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dpa.ranking import PreferenceDistance, log_trajectory, occupancy_features, rank_of, transport_cost
-from dpa.ranking.features import feature_names, feature_weights
+from dpa.ranking import PreferenceDistance, rank_of
+from dpa.ranking.features import feature_names
 from envs.geometry.boxes import nearest_box_distance
 from envs.geometry.edges import RoadEdges
-from envs.scene import EDGE_KINDS, STEP_SECONDS, Scene, polylines
+from envs.scene import EDGE_KINDS, Scene, polylines
 
 COUPLING_STRIDE = 5
 """Couplings are shown at the ends of decisions of 0.5 s: a matrix of 16 x 16 can be read, one of 80 x 80 cannot."""
@@ -219,19 +219,13 @@ def couple(distance: PreferenceDistance, scene: Scene, trajectories: Tensor, age
         >>> coupled.partner[0, 0].tolist() == list(range(16)), float(coupled.share.sum())
         (True, 0.0)
     """
-    names, stride = feature_names(distance.features), max(distance.stride, COUPLING_STRIDE)
-    weights = feature_weights(names, distance.weights)
-    both = torch.cat((trajectories, log_trajectory(scene, trajectories.shape[2]).to(trajectories)[None]))
-    phi, valid = occupancy_features(scene, both, names, ego=agents, stride=stride, clips=distance.clips)
-    rollouts, log = phi[:-1], phi[-1]
-    step = stride * STEP_SECONDS
-    sides = (rollouts, log, valid, valid, weights)
-    moved = transport_cost(*sides, method=distance.method, coupling=True, step=step, **distance.solver)
+    stride = max(distance.stride, COUPLING_STRIDE)
+    rollouts, log, valid, weights, moved = distance.couple(scene, trajectories, agents, stride=stride)
     paid = moved.distance[..., None]
     return Couplings(
         agents=agents,
         stride=stride,
-        features=names,
+        features=feature_names(distance.features),
         weights=weights,
         valid=valid,
         rollouts=rollouts,

@@ -8,7 +8,8 @@ from html import escape
 from importlib import resources
 from typing import NamedTuple
 
-from dpa.report.table import MISSING, difference, signed
+from dpa.report.statistics import verdict
+from dpa.report.table import difference, signed
 
 
 class Html(str):
@@ -126,31 +127,25 @@ def command(text: str) -> Html:
     return element("pre", element("code", text))
 
 
-def interval(mean: float | None, ci95: Sequence[float] | None) -> Html:
-    """A difference with its interval, standing out where the interval does not contain 0."""
-    text = difference(mean, ci95)
-    return element("strong", text) if ci95 is not None and _apart(ci95) else html(text)
+def interval(mean: float, ci95: Sequence[float], over: str) -> Html:
+    """A difference with its interval, standing out where something may be said of it."""
+    return _weighed(difference(mean, ci95), ci95, over)
 
 
-def quiet(mean: float | None, ci95: Sequence[float] | None, digits: int = 3) -> Html:
-    """A difference with its interval below the value that it belongs to; nothing where there is none."""
-    if mean is None or ci95 is None:
-        return Html("")
+def quiet(mean: float, ci95: Sequence[float], over: str, digits: int = 3) -> Html:
+    """A difference with its interval below the value that it belongs to; otherwise as :func:`interval`."""
     ends = f"[{signed(ci95[0], digits)}, {signed(ci95[1], digits)}]"
-    text = signed(mean, digits)
-    return element("small", element("strong", text) if _apart(ci95) else text, Html("<br>"), ends)
+    return element("small", _weighed(signed(mean, digits), ci95, over), Html("<br>"), ends)
 
 
-def stacked(mean: float | None, ci95: Sequence[float] | None) -> Html:
+def stacked(mean: float, ci95: Sequence[float], over: str) -> Html:
     """A difference above its interval, for a narrow column; otherwise as :func:`interval`."""
-    if mean is None or ci95 is None:
-        return html(MISSING)
     ends = element("small", f"[{signed(ci95[0])}, {signed(ci95[1])}]")
-    return joined([element("strong", signed(mean)) if _apart(ci95) else signed(mean), ends], "")
+    return joined([_weighed(signed(mean), ci95, over), ends], "")
 
 
-def _apart(ci95: Sequence[float]) -> bool:
-    return not ci95[0] <= 0 <= ci95[1]
+def _weighed(text: str, ci95: Sequence[float], over: str) -> Html:
+    return html(text) if verdict(ci95, over) == "open" else element("strong", text)
 
 
 def sources(files: Sequence[str]) -> Html:

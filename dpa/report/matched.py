@@ -17,9 +17,9 @@ from dpa.report.table import DIFFERENCE_TITLE, MISSING, REFERENCE, difference, n
 SHARPNESS = ("method", "decoding", "spread [m]", "beyond [m]", DIFFERENCE_TITLE)
 """Titles of :func:`sharpness_rows`."""
 ABOUT_SHARPNESS = (
-    "realism minus that of the reference where its rollouts lie as far apart, read between two of its decodings; where "
-    "none of them is as sharp (or as wide), minus that at the nearest, and the method's rollouts lie closer to each "
-    "other (further apart) by what stands under beyond"
+    "realism minus that of the reference at the same spread of rollouts (root mean square distance of an agent's last "
+    "position from its mean over rollouts), read between two of its decodings; where none of them is as sharp (or as "
+    "wide), minus that at the nearest, and the method's spread is smaller (larger) by what stands under beyond"
 )
 
 
@@ -28,9 +28,10 @@ class Matched(NamedTuple):
 
     Attributes:
         change: of realism, method minus reference.
-        spread: mean distance between the method's rollouts of a scene [m].
-        beyond: by how much they lie further apart than those of every decoding of the reference [m]; below 0 where they
-            lie closer to each other, 0 where the reference is read at the same spread.
+        spread: of the method's rollouts of a scene [m]: the root mean square distance of an agent's last position from
+            its mean over rollouts, the mean over agents, scenes and seeds.
+        beyond: by how much it is larger than that of every decoding of the reference [m]; below 0 where it is smaller,
+            0 where the reference is read at the same spread.
     """
 
     change: Interval
@@ -86,10 +87,10 @@ def matched_difference(
 ) -> Matched | None:
     """Realism of a method at one decoding minus the reference's at the same spread of rollouts.
 
-    The reference at several decodings is a line, realism over the mean distance between the rollouts of a scene, and is
-    read between two of its points; beyond both of its ends, at the end. A method that only samples more sharply lies on
-    that line. Each resample draws seeds and scenes as in :func:`~dpa.report.statistics.paired_bootstrap` and makes line
-    and point anew.
+    The reference at several decodings is a line, realism over the spread of the rollouts of a scene, and is read
+    between two of its points; beyond both of its ends, at the end. A method that only samples more sharply lies on that
+    line. Each resample draws seeds and scenes as in :func:`~dpa.report.statistics.paired_bootstrap` and makes line and
+    point anew.
 
     Args:
         mine: of the method.

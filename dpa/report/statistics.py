@@ -41,9 +41,26 @@ class Interval:
     num_scenes: int
 
     @property
-    def excludes_zero(self) -> bool:
-        """Zero lies outside the interval: a difference may be claimed."""
-        return self.low > 0 or self.high < 0
+    def verdict(self) -> str:
+        """What may be said of it as a difference; see :func:`verdict`."""
+        return verdict((self.low, self.high), self.over)
+
+
+def verdict(ci95: Sequence[float], over: str) -> str:
+    """``better``, ``worse`` or ``open``: what a difference allows to be said; of one training run, nothing.
+
+    Args:
+        ci95: ends of its interval.
+        over: what was resampled, see :class:`Interval`.
+
+    Examples:
+        >>> [verdict([0.01, 0.02], over) for over in ("seeds and scenes", "scenes")]
+        ['better', 'open']
+    """
+    low, high = ci95
+    if over == SCENES:
+        return "open"
+    return "better" if low > 0 else "worse" if high < 0 else "open"
 
 
 def paired_bootstrap(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from dpa.report.canvas import CYCLE, INK, NEUTRAL, QUIET, blank_figure, calm, save_figure
+from dpa.report.canvas import CYCLE, INK, QUIET, blank_figure, calm, save_figure
 from dpa.report.statistics import Interval
 
 
@@ -113,7 +113,7 @@ def _dots(axes: Axes, rows: Mapping[str, Mapping[str, Interval]]) -> None:
             y = group + step * (place - (len(names) - 1) / 2)
             axes.plot([value.low, value.high], [y, y], color=color, lw=2, solid_capstyle="round")
             axes.plot(value.mean, y, "o", color=color, ms=5.5, mec="white", mew=1)
-    axes.axvline(0, color=NEUTRAL, lw=1, zorder=1)
+    axes.axvline(0, color=QUIET, lw=1, zorder=1)
     axes.set_yticks(range(len(rows)), list(rows))
     axes.set_ylim(len(rows) - 0.5, -0.5)
     axes.tick_params(axis="y", length=0)

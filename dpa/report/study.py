@@ -103,7 +103,7 @@ class Evaluations:
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
-        self._read: dict[str, dict[str, list[float | None]] | None] = {}
+        self._read: dict[str, dict[str, Any]] = {}
 
     def __call__(self, file: str) -> Mapping[str, list[float | None]] | None:
         """Values of each scene by figure; None if the file is not in the folder.
@@ -111,10 +111,17 @@ class Evaluations:
         Raises:
             ValueError: the file is no result of an evaluation.
         """
+        return self._content(file)["per_scene"]
+
+    def scenes(self, file: str) -> list[str] | None:
+        """Names of the scenes, in order; None if the file is not in the folder or does not tell."""
+        return self._content(file).get("scenes")
+
+    def _content(self, file: str) -> dict[str, Any]:
         if file not in self._read:
             path = self.folder / file
             content = read_json(path) if path.is_file() else {"per_scene": None}
             if not isinstance(content, dict) or "per_scene" not in content:
                 raise ValueError(f"{path} has no 'per_scene'; it is no result of an evaluation.")
-            self._read[file] = content["per_scene"]
+            self._read[file] = {name: content.get(name) for name in ("per_scene", "scenes")}
         return self._read[file]

@@ -64,8 +64,8 @@ def summarise(rows: Sequence[Mapping[str, Any]], paired: Sequence[Mapping[str, A
 
     Returns:
         Records ``{"method", "top_p", "temperature", "n_seeds", "n_scenes", <every COLUMNS key and measure of a row>,
-        "realism_difference", "ci95"}`` in the order of first appearance. A mean over seeds of which one has no value is
-        None.
+        "realism_difference", "ci95", "over"}`` in the order of first appearance. A mean over seeds of which one has no
+        value is None.
 
     Raises:
         ValueError: a NaN, or a paired entry that fits no record or several.
@@ -87,10 +87,10 @@ def summarise(rows: Sequence[Mapping[str, Any]], paired: Sequence[Mapping[str, A
         for key in measures:
             if key not in IDENTITY:
                 record[key] = _mean([row.get(key) for row in members], method, key)
-        records.append(record | {"realism_difference": None, "ci95": None})
+        records.append(record | {"realism_difference": None, "ci95": None, "over": None})
     for entry in paired:
         record = _owner(entry, records)
-        record["realism_difference"], record["ci95"] = entry["realism_difference"], list(entry["ci95"])
+        record |= {"ci95": list(entry["ci95"])} | {name: entry[name] for name in ("realism_difference", "over")}
     return records
 
 
@@ -207,9 +207,11 @@ def print_table(
         title: above the table.
         console: where to print; standard output by default.
     """
-    console = console or Console()
-    table = to_rich(rows, paired, title=title)
-    # Numbers folded over two lines are misread; a narrow terminal wraps or scrolls whole lines instead.
+    print_whole(to_rich(rows, paired, title=title), console or Console())
+
+
+def print_whole(table: Table, console: Console) -> None:
+    """Print a table without folding cells: numbers over two lines are misread, and terminals wrap or scroll lines."""
     options = console.options.update(width=1_000)
     options = options.update(width=console.measure(table, options=options).maximum)
     console.print(Segments(console.render(table, options)), crop=False, soft_wrap=True, end="")

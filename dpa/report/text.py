@@ -146,7 +146,7 @@ def _published(experiment: Experiment, titles: Sequence[str]) -> Iterator[list[s
 
 
 def sharpness_table(experiment: Experiment, evaluations: Evaluations) -> str | None:
-    """Realism of every method minus that of the reference where its rollouts lie as far apart.
+    """Realism of every method minus that of the reference at the same spread of rollouts.
 
     Args:
         experiment: that tried several decodings.
@@ -197,10 +197,11 @@ def _made(experiment: Experiment) -> str:
     scenes, over = experiment.scenes, "both" if len(experiment.seeds) > 1 else "scenes alone"
     return (
         f"{scenes['train']} training, {scenes['tune']} tuning and {scenes['eval']} evaluation scenes of "
-        f"{scenes['source']}; numbers are of the {experiment.reported}; seeds {', '.join(map(str, experiment.seeds))}; "
-        f"realism of {experiment.metric}; {experiment.date[:10] or MISSING}, commit "
-        f"{experiment.revision or MISSING}; {experiment.machine}; {duration(experiment.worker_seconds)} of one "
-        f"worker. Differences are paired by scene and seed, with 95 % intervals over {over}."
+        f"{scenes['source']}; numbers are of the {experiment.reported}, {experiment.num_rollouts} rollouts of each; "
+        f"seeds {', '.join(map(str, experiment.seeds))}; realism of {experiment.metric}; "
+        f"{experiment.date or MISSING}, commit {experiment.revision or MISSING}; {experiment.machine}; "
+        f"{duration(experiment.worker_seconds)} of one worker. "
+        f"Differences are paired by scene and seed, with 95 % intervals over {over}."
     )
 
 

@@ -143,7 +143,7 @@ def read_curve(folder: str | os.PathLike[str], metric: str) -> list[tuple[int, f
     if not path.is_file():
         known = sorted(str(p.relative_to(path.parents[metric.count("/")]))[:-4] for p in _curves(Path(folder)))
         raise FileNotFoundError(f"{folder} has no curve {metric!r}; it has {', '.join(known) or 'none'}.")
-    return [(int(step), float(value)) for step, value in _complete_rows(path)]
+    return [(int(step), float(value)) for step, value in complete_rows(path)]
 
 
 class CsvLogger:
@@ -314,14 +314,15 @@ def _exhibits(folder: Path) -> list[Path]:
     return sorted(path for path in found if path.is_file() and path.stem.isdigit())
 
 
-def _complete_rows(path: Path) -> list[list[str]]:
+def complete_rows(path: Path) -> list[list[str]]:
+    """Rows of a curve's file, without a last one that a kill cut short."""
     lines = path.read_text().splitlines(keepends=True)
     return [line.strip().split(",") for line in lines if line.endswith("\n")]
 
 
 def _drop_rows_after(path: Path, step: int | None) -> None:
     try:
-        rows = [] if step is None else [row for row in _complete_rows(path) if int(row[0]) <= step]
+        rows = [] if step is None else [row for row in complete_rows(path) if int(row[0]) <= step]
     except ValueError as error:
         raise ValueError(f"{path} is no curve ({error}); remove it and run again.") from None
     if rows:

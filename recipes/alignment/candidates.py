@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -30,6 +30,7 @@ from dpa.training.batches import log_item
 from envs import keys
 from envs.scene import SceneSource
 from envs.seeding import make_generator
+from recipes.alignment.data import RANKED, SIDES, check_data
 
 
 class Group(NamedTuple):
@@ -42,7 +43,7 @@ class Group(NamedTuple):
         token_valid: ``[A, T]`` bool, the same for both sides, so that nothing but the motion tells them apart.
         agent_preference: ``[M, A]`` int64 of pairs, see :func:`~dpa.preferences.agent_preference`; None where agents
             have no distance of their own.
-        sides: how the two sides belong together, one of the values of :data:`SIDES`.
+        sides: how the two sides belong together, one of the values of :data:`~recipes.alignment.data.SIDES`.
     """
 
     context: SceneContext
@@ -51,31 +52,6 @@ class Group(NamedTuple):
     token_valid: Tensor
     agent_preference: Tensor | None = None
     sides: str = "pairs"
-
-
-SIDES = {
-    "pairs": "pairs",
-    "best": "targets",
-    "sets": "sets",
-    "ranking": "ranking",
-    "adversarial": "pairs",
-    "expert": "pairs",
-}
-"""Ways to learn from the rollouts of a scene (``config/method``), and what each gives: M pairs, M targets to imitate,
-two sets of any sizes, or one ranking, whose nearer half is the preferred side and the rest the unpreferred one."""
-RANKED = ("pairs", "best", "sets", "ranking")
-"""Those of them that read ranks."""
-READ = {
-    "pairs": ("rank_by", "pairs", "num", "margin", "rankings_per_scene"),
-    "best": ("rank_by", "num"),
-    "sets": ("rank_by", "num", "num_unpreferred"),
-    "ranking": ("rank_by", "num"),
-    "adversarial": ("num",),
-    "expert": ("num",),
-}
-"""Options of each beside ``kind``."""
-PAIRS = ("nearest_farthest", "random", "all")
-"""Ways to pair the rollouts of a group."""
 
 
 class Chosen(NamedTuple):
@@ -98,10 +74,11 @@ def make_candidates(
     """Choose rollouts of the scenes of a store.
 
     Args:
-        data: ``kind`` (one of :data:`SIDES`), ``rank_by`` (``distance`` or ``ade``; for :data:`RANKED` ones) and
-            ``num``: pairs, targets or rollouts of a scene; a whole number of them, or a share of its rollouts below 1.
+        data: options of :mod:`recipes.alignment.data`: ``kind`` (one of its ``SIDES``), ``rank_by`` (``distance`` or
+            ``ade``; of its ``RANKED`` kinds) and ``num``: pairs, targets or rollouts of a scene; a whole number of
+            them, or a share of its rollouts below 1.
 
-            - pairs: also ``pairs`` (one of :data:`PAIRS`; ``all`` takes no ``num``), ``margin`` (share of the scene's
+            - pairs: also ``pairs`` (one of its ``PAIRS``; ``all`` takes no ``num``), ``margin`` (share of the scene's
               mean distance by which the sides of a pair differ at least) and ``rankings_per_scene`` (pairs kept of a
               scene in the mean, see :func:`~dpa.preferences.pairs.thin_out`; None keeps all);
             - sets: ``num`` nearest rollouts against ``num_unpreferred`` farthest ones;
@@ -246,125 +223,6 @@ def _choose_pairs(data: DictConfig, distance: Tensor, seed: int) -> list[Chosen]
     if data.rankings_per_scene is not None:
         kept = thin_out(kept, data.rankings_per_scene, make_generator(seed, "rankings"))
     return [Chosen(near[pairs], far[pairs]) for near, far, pairs in zip(preferred, unpreferred, kept, strict=True)]
-
-
-def num_candidates(data: DictConfig, held: int) -> tuple[int, int]:
-    """How many rollouts of a scene that is learnt from stand on either side, M and N; a margin may leave fewer.
-
-    Args:
-        data: of a method, see :func:`make_candidates`.
-        held: K, rollouts of a scene.
-
-    Examples:
-        >>> data = OmegaConf.create({"kind": "sets", "rank_by": "distance", "num": 0.25, "num_unpreferred": 16})
-        >>> num_candidates(data, held=32)
-        (8, 16)
-    """
-    data = check_data(data, held)
-    if data.kind == "ranking":
-        whole = data.num or held
-        return (whole + 1) // 2, whole // 2
-    num = held * (held - 1) // 2 if data.kind == "pairs" and data.pairs == "all" else data.num
-    if data.kind == "pairs" and data.rankings_per_scene is not None:
-        num = min(num, max(1, int(data.rankings_per_scene)))  # of half a pair in the mean, a scene has one or none
-    return num, {"best": 0, "sets": data.get("num_unpreferred")}.get(data.kind, num)
-
-
-def check_data(data: DictConfig, held: int) -> DictConfig:
-    """Refuse options of a method's data before any work.
-
-    Args:
-        data: of a method, see :func:`make_candidates`.
-        held: K, rollouts of a scene.
-
-    Returns:
-        The options, shares of the rollouts as whole numbers.
-
-    Raises:
-        ValueError: an unknown kind, option, ranking or way to pair, or more rollouts than there are.
-    """
-    counted = _counted(data, held)
-    _check(counted, held, data)
-    return counted
-
-
-def _counted(data: DictConfig, held: int) -> DictConfig:
-    """Shares of a scene's rollouts as whole numbers, at least one."""
-    shares = {name: data.get(name) for name in ("num", "num_unpreferred") if isinstance(data.get(name), float)}
-    for name, share in shares.items():
-        if not 0 < share < 1:
-            raise ValueError(f"method.data.{name} must be a whole number, or a share between 0 and 1, got {share}.")
-    return OmegaConf.merge(data, {name: max(1, round(share * held)) for name, share in shares.items()})
-
-
-def _asked(given: DictConfig, data: DictConfig, name: str) -> str:
-    """An option as it was given, and the number that it stands for where it is a share."""
-    told = f"method.data.{name}={given[name]}"
-    return told if given[name] == data[name] else f"{told} ({data[name]})"
-
-
-def _check(data: DictConfig, held: int, given: DictConfig) -> None:
-    if data.kind not in SIDES:
-        raise ValueError(f"method.data.kind must be one of {', '.join(SIDES)}, got {data.kind!r}.")
-    if unread := sorted(set(map(str, data)) - {"kind", *READ[data.kind]}):
-        raise ValueError(
-            f"method.data.{unread[0]} says nothing to method.data.kind={data.kind}, which takes "
-            f"{', '.join(READ[data.kind])}; leave it out (~method.data.{unread[0]})."
-        )
-    if data.kind in RANKED and data.rank_by not in (keys.DISTANCE, keys.ADE):
-        raise ValueError(f"method.data.rank_by must be distance or ade, got {data.rank_by!r}.")
-    if data.kind == "pairs" and data.pairs not in PAIRS:
-        raise ValueError(f"method.data.pairs must be one of {', '.join(PAIRS)}, got {data.pairs!r}.")
-    if data.kind == "pairs" and data.pairs == "all":
-        if data.num is not None:
-            raise ValueError(
-                f"method.data.pairs=all takes every pair, and {_asked(given, data, 'num')} asks for some; say "
-                "method.data.num=null, and rankings_per_scene to keep fewer."
-            )
-        _check_pairs(data, held * (held - 1) // 2)
-        return
-    if data.kind == "ranking" and data.num is None:
-        return
-    for name in ("num", "num_unpreferred") if data.kind == "sets" else ("num",):
-        if type(data.get(name)) is not int:
-            raise ValueError(
-                f"method.data.{name} must be a whole number, or a share between 0 and 1, got {data.get(name)!r}."
-            )
-        if data[name] < 1:
-            raise ValueError(f"method.data.{name} must be 1 or more, got {data[name]}.")
-    _check_enough(data, held, given)
-    if data.kind == "pairs":
-        _check_pairs(data, data.num)
-
-
-def _check_pairs(data: DictConfig, pairs: int) -> None:
-    if data.margin < 0:
-        raise ValueError(f"method.data.margin must be 0 or more, got {data.margin}.")
-    if data.rankings_per_scene is None:
-        return
-    if not data.rankings_per_scene > 0:
-        raise ValueError(f"method.data.rankings_per_scene must be positive, got {data.rankings_per_scene}.")
-    if data.rankings_per_scene > pairs:
-        raise ValueError(
-            f"method.data.rankings_per_scene={data.rankings_per_scene} and a scene has {pairs} pairs; lower it, take "
-            "more of the rollouts (method.data.num), or collect more of them."
-        )
-
-
-def _check_enough(data: DictConfig, held: int, given: DictConfig) -> None:
-    asked, needed = _asked(given, data, "num"), data.num
-    if data.kind == "pairs":
-        needed *= 2
-    elif data.kind == "sets":
-        asked = f"{asked} and {_asked(given, data, 'num_unpreferred')}"
-        needed += data.num_unpreferred
-    elif data.kind == "ranking" and data.num < 2:
-        raise ValueError(f"a ranking needs two rollouts, got {asked}; say 2 or more, or null for all.")
-    if needed > held:
-        raise ValueError(
-            f"{asked} needs {needed} rollouts of a scene and there are {held}; lower it, or collect again with a "
-            "larger collection.num_rollouts."
-        )
 
 
 def _check_expert(data: DictConfig, store: PreferenceStore, expert: PreferenceStore | None) -> PreferenceStore:

@@ -12,8 +12,10 @@ from omegaconf import DictConfig
 
 from dpa.policy import ContextOptions, MotionLM
 from dpa.preferences import PreferenceStore
+from envs.progress import message
 from envs.store import SceneStore
-from recipes.alignment.candidates import SIDES, Candidates, make_candidates
+from recipes.alignment.candidates import Candidates, make_candidates
+from recipes.alignment.data import SIDES
 from recipes.alignment.watch import ImitationLook, Look, Watch
 from recipes.common.cli import deciding, plain
 from recipes.common.models import open_policy, weights_digest
@@ -63,16 +65,24 @@ class Inputs:
             preferences: folder of the store that :mod:`recipes.collect` made with it.
             expert: folder of the store of an expert.
             scenes: that the preferences are of.
-            among: indices of the scenes to learn from; by default all that the preferences are of.
+            among: indices of the scenes to learn from; by default all that the preferences are of, and where these
+                are not all scenes it is told how many.
             device: of the model.
 
         Raises:
-            ValueError: preferences of other scenes or of another policy.
+            ValueError: preferences of other scenes or of another policy, or that lack a scene of ``among``.
         """
         model, context, config = open_policy(policy, device)
         store = open_preferences(preferences, scenes, model, policy)
-        ranked = store.scenes.tolist()
-        learnt = sorted(set(ranked) & set(ranked if among is None else among))
+        ranked = set(store.scenes.tolist())
+        learnt = sorted(ranked if among is None else among)
+        if missing := len(set(learnt) - ranked):
+            raise ValueError(
+                f"{preferences} lacks {missing} of the {len(learnt)} scenes to learn from; run what fills it to the "
+                "end."
+            )
+        if among is None and len(learnt) < len(scenes):
+            message(f"{preferences} holds {len(learnt)} of {len(scenes)} scenes; only these are learnt from.")
         return cls(model, context, config, scenes, store, None if expert is None else PreferenceStore(expert), learnt)
 
     def deciding(self, method: DictConfig, alignment: DictConfig, seed: int) -> dict[str, Any]:

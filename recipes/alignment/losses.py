@@ -14,7 +14,7 @@ from dpa.losses import (
 )
 from dpa.policy import MotionLM
 from envs import keys
-from recipes.alignment.candidates import SIDES, num_candidates
+from recipes.alignment.data import SIDES, num_candidates
 from recipes.alignment.draws import num_drawn
 from recipes.common.cli import build
 

@@ -10,7 +10,6 @@ python -m recipes.benchmark transport --threads 2                  # against a l
 from __future__ import annotations
 
 import argparse
-import platform
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,6 +18,7 @@ import torch
 
 from envs.files import write_json
 from recipes.benchmark import realism, rollout, scenes, transport
+from recipes.common.provenance import processor
 
 PARTS = {
     "realism": (realism, "seconds of the realism metric per scene"),
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    machine = {"processor": platform.processor() or platform.machine(), "torch": torch.__version__}
+    machine = {"processor": processor(), "torch": torch.__version__}
     if out is not None:
         write_json(out, {"part": part, "options": options, "machine": machine, "rows": rows})
     return 0

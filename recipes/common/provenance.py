@@ -8,6 +8,7 @@ import platform
 import shlex
 import subprocess
 import sys
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -39,6 +40,33 @@ def provenance(recipe: str, device: str) -> dict[str, Any]:
         "machine": machine,
         "date": datetime.now(UTC).date().isoformat(),
         "command": pasteable(recipe),
+    }
+
+
+def merged(made: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What made several pieces of work, as one: what differs is told side by side, dates from the first to the last.
+
+    Args:
+        made: :func:`provenance` of each piece.
+
+    Examples:
+        >>> one = {"revision": "a1", "machine": "here", "date": "2026-11-23", "versions": {"torch": "2.13.0"}}
+        >>> merged([one, one | {"revision": None, "date": "2026-11-24"}])["revision"]
+        'a1, none'
+        >>> merged([one, one | {"date": "2026-11-24"}])["date"]
+        '2026-11-23 to 2026-11-24'
+    """
+
+    def told(values: Iterable[Any]) -> str:
+        return ", ".join(dict.fromkeys("none" if value is None else str(value) for value in values))
+
+    names = dict.fromkeys(name for each in made for name in each["versions"])
+    dates = sorted({each["date"] for each in made})
+    return {
+        "versions": {name: told(each["versions"].get(name) for each in made) for name in names},
+        "revision": told(each["revision"] for each in made),
+        "machine": told(each["machine"] for each in made),
+        "date": " to ".join(dict.fromkeys((dates[0], dates[-1]))),
     }
 
 

@@ -12,7 +12,7 @@ from dpa.realism.config import RealismConfig
 from dpa.report.experiment import REPORTED
 from dpa.report.table import REFERENCE
 from dpa.tokens import VerletTokenizer
-from recipes.alignment.candidates import check_data
+from recipes.alignment.data import check_data
 from recipes.alignment.losses import check_fit, make_loss
 from recipes.collect import check_collection
 from recipes.common.cli import check_steps, told_of

@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from dpa.report.table import REFERENCE
 from envs.seeding import derive_seed
-from recipes.alignment.candidates import RANKED
+from recipes.alignment.data import RANKED
 from recipes.common.cli import build
 from recipes.experiment.runs import SNAPSHOT
 

@@ -1,20 +1,21 @@
-"""The stages of a study, one after the other, and the account of what each took."""
+"""The stages of a study, one after the other, and the account of what each took and what made it."""
 
 from __future__ import annotations
 
 import fcntl
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from dpa.report.experiment import read_json
 from envs.files import write_json
+from recipes.common.provenance import merged
 from recipes.experiment.pool import Job, Workers
 
 
 class Stages:
-    """Runs stages and keeps how long each job took when it was done for the first time.
+    """Runs stages and keeps how long each job took when it was done for the first time, and by what code and machine.
 
     Several experiments share an account, as they share what the jobs make: reading a result back costs nothing in it.
     Seconds are those of one worker. Of training they count all steps; of other jobs that a kill or an error beside them
@@ -22,12 +23,15 @@ class Stages:
 
     Args:
         workers: that run the jobs.
-        path: of the account, a JSON ``{stage: {job: seconds}}``.
+        path: of the account, a JSON ``{stage: {job: seconds}}``; beside it stands ``origins.json``, ``{"made": [...],
+            "jobs": {stage: {job: place in made}}}``.
+        made: :func:`~recipes.common.provenance.provenance` of the jobs that run now.
     """
 
-    def __init__(self, workers: Workers, path: Path) -> None:
-        self.workers, self.path = workers, path
+    def __init__(self, workers: Workers, path: Path, made: Mapping[str, Any]) -> None:
+        self.workers, self.path, self._made = workers, path, made
         self.account = read_account(path)
+        self._origins = read_json(self._origins_path) if self._origins_path.is_file() else {"made": [], "jobs": {}}
         self._asked: dict[str, set[str]] = {}
 
     def run(
@@ -54,13 +58,33 @@ class Stages:
         self._asked.setdefault(stage, set()).add(job)
         kept = self.account.setdefault(stage, {})
         if job not in kept:
+            self._sign(stage, job)
             kept[job] = seconds
             write_json(self.path, self.account)
+
+    def _sign(self, stage: str, job: str) -> None:
+        made = self._origins["made"]
+        if self._made not in made:
+            made.append(dict(self._made))
+        self._origins["jobs"].setdefault(stage, {})[job] = made.index(self._made)
+        write_json(self._origins_path, self._origins)
+
+    @property
+    def _origins_path(self) -> Path:
+        return self.path.with_name("origins.json")
 
     @property
     def seconds(self) -> dict[str, float]:
         """Worker-seconds of each stage, of the jobs that were asked for here."""
         return {name: sum(self.account[name][job] for job in sorted(jobs)) for name, jobs in self._asked.items()}
+
+    @property
+    def made(self) -> dict[str, Any]:
+        """What made the jobs that were asked for here, see :func:`~recipes.common.provenance.merged`."""
+        unsigned = {**self._made, "versions": {}, "revision": "unknown", "machine": "unknown"}
+        made, jobs = [*self._origins["made"], unsigned], self._origins["jobs"]
+        asked = [(stage, job) for stage, each in self._asked.items() for job in sorted(each)]
+        return merged([made[jobs.get(stage, {}).get(job, -1)] for stage, job in asked])
 
 
 def read_account(path: Path) -> dict[str, dict[str, float]]:

@@ -12,7 +12,7 @@ from dpa.policy import Decoding
 from dpa.report.experiment import read_json
 from dpa.report.statistics import compare_methods
 from dpa.report.table import REFERENCE
-from recipes.alignment.candidates import num_candidates
+from recipes.alignment.data import num_candidates
 from recipes.alignment.draws import num_drawn
 from recipes.alignment.likelihoods import PROBED
 from recipes.common.cli import plain
@@ -48,12 +48,20 @@ class Results:
     Args:
         cfg: of the experiment.
         shown: all rows of the reported scenes. Those scenes are left out of every row for which one has no realism.
+
+    Raises:
+        ValueError: no reported scene has realism in all rows.
     """
 
     def __init__(self, cfg: DictConfig, shown: Sequence[Shown]) -> None:
         self.runs, self.seeds, self.split = runs_of(cfg), list(cfg.seeds), cfg.experiment.split
         scores = [self._scores(run, seed) for _, run in shown for seed in self.seeds]
         self.known = [all(score is not None for score in scene) for scene in zip(*scores, strict=True)]
+        if not any(self.known):
+            raise ValueError(
+                f"no scene of scenes.{self.split} has realism under every policy, so that nothing can be compared; "
+                "name other scenes, of whose agents all features of the metric are scored."
+            )
 
     def rows(self, shown: Sequence[Shown]) -> list[dict[str, Any]]:
         """Means of several runs over the reported scenes, each for all seeds, with the file behind each."""

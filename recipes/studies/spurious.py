@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dpa.ranking.agreement import rank_correlation
 from dpa.report.statistics import Interval, paired_bootstrap, summary
-from recipes.studies.study import over_scenes
+from recipes.studies.study import over_scenes, with_realism
 
 QUANTITIES = {
     "jerk": "mean squared jerk, 10 Hz",
@@ -79,13 +79,7 @@ class Ranked:
         return np.array([[row[i]["realism"]["random"][figure] for i in self._with_realism()] for row in self.rows])
 
     def _with_realism(self) -> list[int]:
-        scenes = range(len(self.rows[0]))
-        kept = [i for i in scenes if all(row[i]["realism"]["random"]["realism"] is not None for row in self.rows)]
-        if not kept:
-            raise ValueError(
-                "no scene has realism: none scores all features of the metric; choose scenes with vehicles."
-            )
-        return kept
+        return with_realism(self.rows, lambda scene: [scene["realism"]["random"]["realism"]])
 
 
 def partial(xy: NDArray, xz: NDArray, yz: NDArray) -> NDArray:

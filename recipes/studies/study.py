@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -186,6 +186,22 @@ def over_scenes(values: np.ndarray, name: str) -> Interval:
             f"{name}: in no scene do both measures tell rollouts apart, so that nothing is ranked; choose other scenes."
         )
     return summary(values[:, known])
+
+
+def with_realism(rows: Sequence[Sequence[Mapping[str, Any]]], realism: Callable[[Any], Sequence[Any]]) -> list[int]:
+    """Places of the scenes that have realism under all policies.
+
+    Args:
+        rows: for each policy what was measured of each scene.
+        realism: of what was measured of a scene the values that must be known.
+
+    Raises:
+        ValueError: there is none.
+    """
+    places = [i for i in range(len(rows[0])) if all(None not in realism(row[i]) for row in rows)]
+    if not places:
+        raise ValueError("no scene has realism: none scores all features of the metric; choose scenes with vehicles.")
+    return places
 
 
 def as_json(content: Any) -> Any:

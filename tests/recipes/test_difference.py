@@ -14,7 +14,7 @@ from dpa.report.experiment import read_experiment
 from dpa.report.statistics import paired_bootstrap
 from dpa.report.study import Evaluations
 from recipes import difference
-from recipes.difference import Difference, differences, differences_of_files
+from recipes.difference import Difference, Side, differences, differences_of_files
 from tests.dpa.report.runs import BEST, COMMON, SEEDS, likelihoods, values, write_runs
 
 
@@ -25,7 +25,10 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def found(runs: Path, method: str, other: str, *at: tuple[float, float]) -> dict[str, Difference]:
     experiment = read_experiment(runs / "experiments" / "methods.json")
-    return {each.measure: each for each in differences(experiment, method, other, Evaluations(runs), at)}
+    return {
+        each.measure: each
+        for each in differences(Side(experiment, method), Side(experiment, other), Evaluations(runs), at)
+    }
 
 
 def test_each_method_stands_at_its_own_best_decoding(runs: Path) -> None:
@@ -57,6 +60,34 @@ def test_likelihoods_are_compared_too_and_a_scene_that_one_run_has_no_value_of_c
     gain = np.mean(likelihoods("dpa_omf")["nll_preferred"]) - np.mean(likelihoods("dpa_adef")["nll_preferred"])
     assert measures["nll_preferred"].interval.mean == pytest.approx(gain)
     assert measures["red_light"].interval.num_scenes == measures["realism"].interval.num_scenes - 1
+
+
+def test_a_method_of_another_experiment_is_named_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    mine = write_runs(tmp_path)
+    content = json.loads((mine / "experiments" / "methods.json").read_text())
+    (mine / "experiments" / "again.json").write_text(json.dumps(content | {"name": "again"}))
+    told = []
+    for other in ("dpa_adef", "again:dpa_adef"):
+        monkeypatch.setattr(sys, "argv", ["difference", str(mine), "methods", "dpa_omf", other])
+        difference.main()
+        told.append([line.split() for line in capsys.readouterr().out.splitlines() if "realism" in line])
+    assert told[0] == told[1] and len(told[0]) == 1
+
+
+def test_evaluations_of_other_scenes_in_one_folder_are_not_paired(tmp_path: Path) -> None:
+    mine = write_runs(tmp_path)
+    experiment = read_experiment(mine / "experiments" / "methods.json")
+    for method, scenes in (("dpa_omf", "other"), ("reference", "scene")):
+        for row in (*experiment.own_best.rows, *experiment.at_common.rows):
+            if row["method"] == method:
+                path = mine / row["file"]
+                content = json.loads(path.read_text())
+                names = [f"{scenes} {place}" for place in range(len(content["per_scene"]["realism"]))]
+                path.write_text(json.dumps(content | {"scenes": names}))
+    with pytest.raises(ValueError, match=r"are of other scenes.*keep each study, and each archive of one, in a folder"):
+        found(mine, "dpa_omf", "reference")
 
 
 def test_a_file_that_is_lost_is_named(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from recipes.experiment.methods import drawing_seed, read_setups, setup_of
 from recipes.experiment.pool import Workers
 from recipes.experiment.runs import Run
 from recipes.experiment.stages import Stages, alone_in, read_account
-from recipes.experiment.summary import budget
+from recipes.experiment.summary import Results, budget
 
 EXPERIMENTS = sorted(path.stem for path in (Path(CONFIG["config_path"]) / "experiment").glob("*.yaml"))
 FURTHER = "+experiment.setup.dpa_omf={start:dpa_adef}"
@@ -311,31 +311,58 @@ def test_a_budget_counts_what_a_method_starts_from_and_whom_it_learns_from() -> 
     )
 
 
+def test_scenes_without_realism_end_a_comparison_with_the_option_that_names_them(tmp_path: Path) -> None:
+    cfg, run = configuration("seeds=[0]", f"output={tmp_path}"), Run("reference", Decoding(0.95, 1.0))
+    path = runs_of(cfg).evaluation(0, run, "eval")
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps({"per_scene": {"realism": [None, None]}}))
+    with pytest.raises(ValueError, match=r"no scene of scenes\.eval has realism under every policy.*name other scenes"):
+        Results(cfg, [("reference", run)])
+
+
 # --- the account ----------------------------------------------------------------------------------------------------
+MADE = {"revision": "a1", "machine": "here", "date": "2026-11-23", "versions": {"torch": "2.13.0"}}
+
+
 def test_the_account_keeps_what_each_job_took_the_first_time(tmp_path: Path) -> None:
     path = tmp_path / "stages.json"
     with Workers(1, threads=1) as workers:
-        Stages(workers, path).run("sleep", _sleep, 1.0, [(0.01, "a"), (0.03, "b")])
+        Stages(workers, path, MADE).run("sleep", _sleep, 1.0, [(0.01, "a"), (0.03, "b")])
         first = read_account(path)
         assert first == json.loads(path.read_text()) and set(first["sleep"]) == {"sleep 0.01 a", "sleep 0.03 b"}
         assert first["sleep"]["sleep 0.03 b"] >= 0.03
-        again = Stages(workers, path)
+        again = Stages(workers, path, MADE | {"revision": "b2", "date": "2026-11-24"})
         again.run("sleep", _sleep, 0.0, [(0.01, "a"), (0.03, "b"), (0.02, "c")])  # done before: takes no time
     kept = read_account(path)["sleep"]
     assert {name: kept[name] for name in first["sleep"]} == first["sleep"] and "sleep 0.02 c" in kept
     assert again.seconds["sleep"] == pytest.approx(sum(kept.values()))
+    told = again.made
+    assert (told["revision"], told["date"]) == ("a1, b2", "2026-11-23 to 2026-11-24"), "a and b keep what made them"
+
+
+def test_what_is_read_back_alone_keeps_the_code_that_made_it(tmp_path: Path) -> None:
+    path = tmp_path / "stages.json"
+    with Workers(1, threads=1) as workers:
+        Stages(workers, path, MADE).run("sleep", _sleep, 1.0, [(0.01, "a")])
+        later = Stages(workers, path, MADE | {"revision": "b2", "date": "2026-11-24"})
+        later.run("sleep", _sleep, 0.0, [(0.01, "a")])
+        assert (later.made["revision"], later.made["date"]) == ("a1", "2026-11-23")
+        path.with_name("origins.json").unlink()
+        unsigned = Stages(workers, path, MADE)
+        unsigned.run("sleep", _sleep, 0.0, [(0.01, "a")])
+    assert unsigned.made["revision"] == "unknown", "of an account that nobody signed nothing is claimed"
 
 
 def test_seconds_that_a_job_spent_for_another_stage_are_booked_there(tmp_path: Path) -> None:
     with Workers(1, threads=1) as workers:
-        stages = Stages(workers, tmp_path / "stages.json")
+        stages = Stages(workers, tmp_path / "stages.json", MADE)
         stages.run("collect", _sleep_and_rank, 1.0, [(0.6,)])
     assert stages.seconds["rank"] == 0.59 and 0.01 <= stages.seconds["collect"] < 0.6
 
 
 def test_a_job_that_knows_what_it_took_is_believed(tmp_path: Path) -> None:
     with Workers(1, threads=1) as workers:
-        stages = Stages(workers, tmp_path / "stages.json")
+        stages = Stages(workers, tmp_path / "stages.json", MADE)
         stages.run("align", _trained_before, 7.0, [()])
     assert stages.seconds == {"align": 7.0}
 

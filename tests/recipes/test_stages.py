@@ -39,8 +39,10 @@ from envs.scene import CURRENT_STEP
 from envs.sources.synthetic import straight_road
 from envs.store import SceneStore
 from recipes import evaluate as evaluation
-from recipes.alignment.candidates import READ, Candidates, Group, make_candidates
+from recipes.alignment.candidates import Candidates, Group, make_candidates
+from recipes.alignment.data import READ
 from recipes.alignment.draws import draw_rows, make_batch, parts_of
+from recipes.alignment.inputs import Inputs
 from recipes.alignment.likelihoods import SIDED
 from recipes.alignment.losses import check_fit, make_loss
 from recipes.alignment.watch import Look, Watch
@@ -723,6 +725,14 @@ def test_alignment_learns_from_the_scenes_that_it_is_given(runs: Path, options: 
     assert len(every) == 6 and len(some) == 2
     for group, whole in zip(some, (every[1], every[4]), strict=True):
         assert torch.equal(group.preferred, whole.preferred)
+
+
+def test_rollouts_that_lack_scenes_to_learn_from_are_refused(runs: Path, options: Callable) -> None:
+    cfg = compose_recipe("align", options, runs)
+    scenes, policy = open_splits(cfg.scenes).train, runs / "reference/policy.pt"
+    assert Inputs.open(policy, runs / "preferences", None, scenes, [1, 4], "cpu").learnt == [1, 4]
+    with pytest.raises(ValueError, match=r"preferences lacks 1 of the 2 scenes to learn from; run what fills it"):
+        Inputs.open(policy, runs / "preferences", None, scenes, [1, 99], "cpu")
 
 
 def test_rankings_are_thinned_among_the_scenes_that_are_learnt_from(runs: Path, options: Callable) -> None:

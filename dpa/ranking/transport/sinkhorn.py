@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -36,6 +37,9 @@ class Sinkhorn:
 
     Raises:
         ValueError: an option out of its range.
+
+    Warns:
+        UserWarning: some problem stopped by ``iterations`` and not by ``tolerance``.
     """
 
     epsilon: float = 0.02
@@ -96,6 +100,12 @@ class Sinkhorn:
             done = done | (error <= self.tolerance)
             if bool(done.all()):
                 break
+        if not bool(done.all()):
+            warnings.warn(
+                f"sinkhorn left couplings further than tolerance={self.tolerance:g} from their marginals after "
+                f"iterations={self.iterations}; allow more of these, or a larger epsilon than {self.epsilon:g}.",
+                stacklevel=2,
+            )
         coupling = pairs * (u[:, :, None] + v[:, None] - cost / epsilon).exp()
         # Steps that do not count have no cost, and potentials at will.
         return Dense(coupling.where(pairs > 0, 0.0), error)

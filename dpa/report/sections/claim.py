@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from dpa.report.experiment import SAMPLED, Experiment, decoding_against, decoding_of, in_words
-from dpa.report.findings import differences_of, headline, reservations, verdict
+from dpa.report.findings import differences_of, headline, reservations
 from dpa.report.markup import Html, element, hint, joined
+from dpa.report.statistics import verdict
 from dpa.report.study import Study
 from dpa.report.table import signed
 
@@ -49,7 +50,7 @@ def _card(experiment: Experiment, title: str, entry: Mapping[str, Any] | None) -
     return element(
         "div",
         element("div", title, class_="card-title"),
-        element("div", signed(entry["realism_difference"]), class_=f"figure {verdict(entry)}"),
+        element("div", signed(entry["realism_difference"]), class_=f"figure {verdict(entry['ci95'], entry['over'])}"),
         element("div", f"[{signed(low)}, {signed(high)}] realism, 95 %"),
         element(
             "div",

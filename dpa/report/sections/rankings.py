@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from dpa.report.canvas import CYCLE
-from dpa.report.charts import Difference, Line, curves, forest, gallery, heat, lines
-from dpa.report.markup import Html, Section, element, hint, interval, joined, table
+from dpa.report.charts import Chart, Difference, Line, curves, forest, gallery, heat, lines
+from dpa.report.markup import Html, Section, element, hint, html, interval, joined, table
 from dpa.report.sections.origin import origin, scope
+from dpa.report.statistics import SCENES, SEEDS_AND_SCENES
 from dpa.report.table import MINUS, MISSING, difference, number
 
 Value = Mapping[str, Any]
@@ -22,6 +23,36 @@ def validity_section(found: Mapping[str, Any]) -> Section:
         found: ``validity/summary.json`` of a study.
     """
     rankings = found["rankings"]
+    columns = {"correlation": "Spearman", "near_half": "nearer half", "nearest": "nearest window",
+               "farthest": "farthest window"}  # fmt: skip
+    parts = [
+        element(
+            "p",
+            "Are the rollouts that a distance calls near to the log also the more realistic ones?",
+            class_="question",
+        ),
+        scope(found),
+        gallery(_validity_charts(rankings)),
+        table(
+            ["ranking", *columns.values()],
+            [[name, *(_cell(v[key], found) for key in columns)] for name, v in rankings.items()],
+        ),
+    ]
+    if found.get("differences"):
+        parts += [
+            element("h3", f"Realism minus that of {found['minus']}"),
+            table(
+                ["ranking", "nearest window", "farthest window"],
+                [
+                    [name, *(_cell(v[key], found) for key in ("nearest", "farthest"))]
+                    for name, v in found["differences"].items()
+                ],
+            ),
+        ]
+    return Section("validity", "Does the distance tell realism?", joined([*parts, origin("validity", found)]))
+
+
+def _validity_charts(rankings: Mapping[str, Any]) -> list[Chart]:
     content = []
     for place, (name, values) in enumerate(rankings.items()):
         x, y = [window["mean"] for window in values["distance"]], values["realism"]
@@ -43,7 +74,7 @@ def validity_section(found: Mapping[str, Any]) -> Section:
         )
     keys = {"all windows": "correlation", "nearer half": "near_half"}
     groups = {name: {row: _difference(values[key]) for row, key in keys.items()} for name, values in rankings.items()}
-    charts = [
+    return [
         curves(
             content,
             "Realism of a window of rollouts",
@@ -60,30 +91,6 @@ def validity_section(found: Mapping[str, Any]) -> Section:
             colours={line.name: line.colour for line in content},
         ),
     ]
-    columns = {"correlation": "Spearman", "near_half": "nearer half", "nearest": "nearest window",
-               "farthest": "farthest window"}  # fmt: skip
-    parts = [
-        element(
-            "p",
-            "Are the rollouts that a distance calls near to the log also the more realistic ones?",
-            class_="question",
-        ),
-        scope(found),
-        gallery(charts),
-        table(["ranking", *columns.values()], [[n, *(_cell(v[key]) for key in columns)] for n, v in rankings.items()]),
-    ]
-    if found.get("differences"):
-        parts += [
-            element("h3", f"Realism minus that of {found['minus']}"),
-            table(
-                ["ranking", "nearest window", "farthest window"],
-                [
-                    [name, *(_cell(v[key]) for key in ("nearest", "farthest"))]
-                    for name, v in found["differences"].items()
-                ],
-            ),
-        ]
-    return Section("validity", "Does the distance tell realism?", joined([*parts, origin("validity", found)]))
 
 
 def sensitivity_section(found: Mapping[str, Any]) -> Section:
@@ -171,7 +178,7 @@ def discriminator_section(found: Mapping[str, Any]) -> Section:
         ),
     ]  # fmt: skip
     head = ["within a scene", *kinds]
-    rows = [[labels[q], *(_cell(values[kind]) for kind in kinds)] for q, values in correlation.items()]
+    rows = [[labels[q], *(_cell(values[kind], found) for kind in kinds)] for q, values in correlation.items()]
     chance = {name: _plain(value) for name, value in found["auc"].items()}
     held_out = [f"{name} {number(run['best']['held_out_auc'], 3)}" for name, run in found["policies"].items()]
     parts = [
@@ -183,7 +190,7 @@ def discriminator_section(found: Mapping[str, Any]) -> Section:
             "How much more strongly by jerk than by the preference distance: "
             f"{_text(found['jerk_minus_distance'])}. Share of rollouts below the log: by the discriminator "
             f"{chance['discriminator']}, by jerk alone {chance['jerk']}. "
-            f"Held-out AUC for each policy: {', '.join(held_out)}."
+            f"Held-out AUC for each policy, the best of all looks, by which training stops: {', '.join(held_out)}."
         ),
     ]
     return Section("discriminator", "What a discriminator ranks by", joined([*parts, origin("discriminator", found)]))
@@ -193,8 +200,11 @@ def _difference(value: Value) -> Difference:
     return Difference(value["mean"], *value["ci95"], hover=[f"{value['scenes']} scenes"])
 
 
-def _cell(value: Value | None) -> Html:
-    return interval(None, None) if value is None else interval(value["mean"], value["ci95"])
+def _cell(value: Value | None, found: Mapping[str, Any]) -> Html:
+    if value is None:
+        return html(MISSING)
+    over = SCENES if len(found["made"]["policies"]) == 1 else SEEDS_AND_SCENES
+    return interval(value["mean"], value["ci95"], over)
 
 
 def _text(value: Value) -> str:

@@ -17,6 +17,7 @@ from dpa.report.markup import (
     facts,
     folded,
     hint,
+    html,
     joined,
     quiet,
     sources,
@@ -30,7 +31,7 @@ from dpa.report.sections.likelihood import likelihood_table
 from dpa.report.sections.origin import code_of
 from dpa.report.sections.safety import safety_tables
 from dpa.report.sections.scaling import scaling_charts
-from dpa.report.statistics import Interval
+from dpa.report.statistics import Interval, verdict
 from dpa.report.study import FIRST, Evaluations
 from dpa.report.table import COLUMNS, MISSING, REFERENCE, difference, duration, number, signed
 
@@ -61,7 +62,7 @@ def experiment_section(experiment: Experiment, colours: Mapping[str, str], evalu
     ]
     about = [
         _scenes(experiment),
-        f"numbers are of the {experiment.reported}",
+        f"numbers are of the {experiment.reported}, {experiment.num_rollouts} rollouts of each",
         f"seeds {', '.join(map(str, experiment.seeds))}",
         *(f"one decoding, {kind}" for kind in compared.keys() - SAMPLED.keys()),
         f"realism metric of {experiment.metric}",
@@ -155,12 +156,13 @@ def matched_curves(experiment: Experiment, colours: Mapping[str, str], evaluatio
     if not any(len(line.x) > 1 for line in content):
         return []
     caption = (
-        "Every decoding of the grid, mean over seeds; the large marker is the one chosen. Left is sharper sampling. A "
+        "Every decoding of the grid, mean over seeds; the large marker is the one chosen. Spread: root mean square "
+        "distance of an agent's last position from its mean over rollouts. Left is sharper sampling. A "
         "method that only samples more sharply lies on the line of the reference; bars are 95 % intervals of how far "
         "above that line a point lies, beyond its ends above its end: one that does not reach it is told apart."
     )
     title = "Realism against sharpness of sampling, tuning scenes"
-    return [curves(content, title, x="distance between the rollouts of a scene [m]", y="realism", caption=caption)]
+    return [curves(content, title, x="spread of the rollouts of a scene [m]", y="realism", caption=caption)]
 
 
 def sharpness_table(experiment: Experiment, evaluations: Evaluations) -> Html:
@@ -198,20 +200,24 @@ def _main_table(experiment: Experiment, comparison: Comparison, evaluations: Eva
         cells = []
         for column in columns:
             if column.key == "realism":
-                change = quiet(record["realism_difference"], record["ci95"], column.digits)
+                told = (record["realism_difference"], record["ci95"], record["over"])
+                change = Html("") if None in told else quiet(*told, column.digits)
             else:
                 found = None if mine == base else paired_figure(mine, base, column.key, evaluations)
                 change = quiet_change(found, column.digits)
             value, paper = number(record[column.key], column.digits), published.get(column.key)
             cells.append(joined([value, change, _paper(paper, column.digits)], ""))
         if against:
-            entry = against.get(method, {})
-            cells.append(stacked(entry.get("realism_difference"), entry.get("ci95")))
+            cells.append(_against(against.get(method)))
         steps = f", {count} steps" if (count := comparison.steps[method]) else ""
         name = joined([experiment.labels[method], element("small", in_words(decoding_of(record)) + steps)], "")
         rows.append([name, *cells, sources([row["file"] for row in mine])])
     note, remarks = _which_loss(experiment), hint(" ".join(_remarks(experiment, comparison)))
     return joined([table(head, rows), *([element("p", note, class_="note")] if note else []), remarks])
+
+
+def _against(entry: Mapping[str, Any] | None) -> Html:
+    return html(MISSING) if entry is None else stacked(entry["realism_difference"], entry["ci95"], entry["over"])
 
 
 def _paper(published: float | None, digits: int) -> Html:
@@ -253,6 +259,7 @@ def _differences(
         found[name] = Difference(
             entry["realism_difference"],
             *entry["ci95"],
+            verdict(entry["ci95"], entry["over"]),
             hover=[
                 f"{in_words(decoding)}, against {_called(experiment, entry['against'])} at {in_words(against)}",
                 f"{entry['n_seeds']} seeds, interval over {entry['over']}",

@@ -49,6 +49,18 @@ def teacher_forced(model: MotionLM, scenes: list[Scene], scene: Tensor, tokens: 
     return log_probs.gather(-1, tokens[:, None, ..., None])[:, 0, ..., 0]
 
 
+def test_a_decision_out_of_turn_is_refused(model: MotionLM, scenes: list[Scene]) -> None:
+    env, actor = drive(model, scenes)
+    second = env.rollout(2, actor)["next"][:, 0].exclude(keys.TOKEN)
+    with pytest.raises(ValueError, match=r"got \[1, 1, 1, 1\] where \[2, 2, 2, 2\] or 0 was due"):
+        actor(second)
+    _, fresh = drive(model, scenes)
+    with pytest.raises(
+        ValueError, match=r"got \[1, 1, 1, 1\] where \[0, 0, 0, 0\] or 0 was due; reset the environment"
+    ):
+        fresh(second)
+
+
 def test_the_contexts_used_last_are_kept() -> None:
     contexts = Contexts([straight_road(count) for count in (1, 2, 3)], most=2)
     first, _, again = contexts[0], contexts[1], contexts[0]

@@ -220,7 +220,8 @@ def test_sinkhorn_goes_to_exact_with_epsilon() -> None:
 def test_sinkhorn_reports_the_marginal_error_that_the_iteration_limit_leaves() -> None:
     x, y = clouds(22, 3, dtype=torch.float64)
     options = {"epsilon": 0.01, "start": None, "iterations": 3}
-    got = transport_cost(x, y, always(), always(), WEIGHTS, method="sinkhorn", coupling=True, **options)
+    with pytest.warns(UserWarning, match=r"further than tolerance=0.01 from their marginals after iterations=3"):
+        got = transport_cost(x, y, always(), always(), WEIGHTS, method="sinkhorn", coupling=True, **options)
     torch.testing.assert_close(got.marginal_error, (got.coupling.sum(-1) - 1 / 20).abs().sum(-1))
     assert (got.marginal_error > 1e-2).all()
 

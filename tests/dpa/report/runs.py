@@ -105,7 +105,10 @@ def write_experiment(
         "curves": {m: {str(seed): curves(folder, m, seed) for seed in SEEDS} for m in others if "@" not in m},
         "budget": {m: {"steps": 60, "rollouts": 960, "start": "reference"} for m in others if "@" not in m},
         "stages": {"pretrain": 5400.0, "align": 125.0}, "worker_seconds": 5525.0,
-        "config": {"mark": "<!--{title}-->", "methods": {"dpa_omf": {"loss": DPO}}},
+        "config": {
+            "mark": "<!--{title}-->", "methods": {"dpa_omf": {"loss": DPO}},
+            "decoding": {"num_rollouts": 4}, "evaluation": {"num_rollouts": 8},
+        },
         "revision": "0123abc", "versions": {"torch": "2.13.0"},
         "machine": "Linux x86_64, 2 CPU cores", "date": "2026-11-21",
         "command": f"python -m recipes.compare experiment={name} 'name=<b>'",

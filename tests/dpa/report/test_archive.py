@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import zipfile
 from pathlib import Path
 
@@ -54,6 +55,22 @@ def test_it_holds_the_values_behind_every_row_and_the_curves_and_neither_weights
 
 def test_equal_studies_give_equal_files(runs: Path, archive: Path, tmp_path: Path) -> None:
     assert report(runs, tmp_path / "again.zip").read_bytes() == archive.read_bytes()
+
+
+def test_scenes_can_be_called_by_number_and_the_numbers_stay(tmp_path: Path) -> None:
+    mine = write_runs(tmp_path / "study")
+    named = sorted(mine.glob("seed_*/*/eval_*.json"))
+    for file in named:
+        content = json.loads(file.read_text())
+        names = [f"recording {place:x}" for place in range(len(content["per_scene"]["realism"]))]
+        file.write_text(json.dumps(content | {"scenes": names}))
+    archive = zipfile.ZipFile(report(mine, tmp_path / "study.zip", numbered=True))
+    assert named and not [name for name in archive.namelist() if b"recording" in archive.read(name)]
+    for file in named:
+        kept = json.loads(archive.read(file.relative_to(mine).as_posix()))
+        assert kept["scenes"][1] == "scene 1" and kept["per_scene"] == json.loads(file.read_text())["per_scene"]
+    with pytest.raises(ValueError, match=r"--number-scenes is for results.zip; page.html shows scenes by their names"):
+        report(mine, tmp_path / "page.html", numbered=True)
 
 
 def test_the_cards_of_ranked_rollouts_are_in_it_without_their_stores(runs: Path, archive: Path, tmp_path: Path) -> None:

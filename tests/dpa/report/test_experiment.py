@@ -42,6 +42,13 @@ def test_the_scenes_that_numbers_are_of_are_told_in_words(file: Path) -> None:
     assert read_experiment(file).reported == "12 evaluation scenes"
 
 
+def test_rollouts_of_a_scene_are_those_of_the_split_that_is_reported(file: Path) -> None:
+    content = json.loads(file.read_text(encoding="utf-8"))
+    assert read_experiment(file).num_rollouts == content["config"]["evaluation"]["num_rollouts"]
+    file.write_text(json.dumps(content | {"split": "tune"}), encoding="utf-8")
+    assert read_experiment(file).num_rollouts == content["config"]["decoding"]["num_rollouts"]
+
+
 def test_a_temperature_of_one_is_not_told() -> None:
     assert (in_words((0.9, 1.0)), in_words((0.9, 0.8))) == ("top-p 0.9", "top-p 0.9, temperature 0.8")
 
@@ -74,6 +81,8 @@ def entry(name: str, **changes: Any) -> Broken:
         (lambda c: c.update(split="train"), r"split must be one of eval, tune, got 'train'"),
         (lambda c: c["own_best"].pop("versus"), r"own_best has no versus"),
         (lambda c: c["own_best"]["versus"][0].update(against="x"), r"versus\[0\] must be against 'dpa_omf', got 'x'"),
+        (lambda c: c["config"].pop("decoding"), r"config\.decoding must be a table of named values, got None"),
+        (lambda c: c["chosen"].pop("dpa_omf"), r"chosen has no dpa_omf"),
         (lambda c: c["chosen"].update(dpa_omf=[0.9]), r"of dpa_omf must be \[top_p, temperature\], got \[0\.9\]"),
         (entry("rows", method="x"), r"rows\[0\] is of 'x', which is none of methods"),
         (entry("rows", realism="high"), r"rows\[0\]: realism must be a number or null, got 'high'"),

@@ -57,7 +57,7 @@ def test_what_does_not_pair_has_no_difference(
 
 
 def test_a_difference_stands_out_where_its_interval_does_not_hold_zero() -> None:
-    apart, not_apart = Interval(0.02, 0.01, 0.03, "scenes", 1, 9), Interval(0.02, -0.01, 0.05, "scenes", 1, 9)
+    apart, not_apart = (Interval(0.02, *ends, "seeds and scenes", 2, 9) for ends in ((0.01, 0.03), (-0.01, 0.05)))
     assert quiet_change(apart) == "<small><strong>+0.020</strong><br>[+0.010, +0.030]</small>"
     assert quiet_change(not_apart, 2) == "<small>+0.02<br>[−0.01, +0.05]</small>"
 

@@ -34,7 +34,7 @@ def test_identical_methods_differ_by_exactly_nothing() -> None:
     scores = np.random.default_rng(0).random((3, 20))
     found = paired_bootstrap(scores, scores)
     assert (found.mean, found.low, found.high) == (0, 0, 0)
-    assert not found.excludes_zero
+    assert found.verdict == "open"
 
 
 @settings(max_examples=20, deadline=None)
@@ -58,8 +58,16 @@ def test_pairing_takes_the_spread_between_scenes_away() -> None:
     rng = np.random.default_rng(3)
     easy_and_hard = rng.normal(0.6, 0.2, (1, 54))
     better = easy_and_hard + 0.01 + rng.normal(0, 0.01, (1, 54))
-    assert paired_bootstrap(better, easy_and_hard).excludes_zero
+    assert paired_bootstrap(better, easy_and_hard).low > 0
     assert summary(better).high - summary(better).low > 0.05
+
+
+def test_a_claim_needs_two_training_runs_and_an_interval_that_leaves_out_zero() -> None:
+    better, worse, open_ = (np.full((2, 4), mean) for mean in (0.1, -0.1, 0.0))
+    nothing = np.zeros((2, 4))
+    told = [paired_bootstrap(values, nothing, num_resamples=10).verdict for values in (better, worse, open_)]
+    assert told == ["better", "worse", "open"]
+    assert paired_bootstrap(better[:1], nothing[:1], num_resamples=10).verdict == "open"
 
 
 def test_seeds_that_disagree_widen_the_interval() -> None:

@@ -229,7 +229,7 @@ def test_the_forest_holds_every_interval_with_its_seeds(page: Page, methods: dic
 def test_decoding_matched_curves_have_realism_over_spread_and_mark_the_chosen_decoding(
     page: Page, methods: dict[str, Any], runs: Path
 ) -> None:
-    figure = figures(page, "distance between the rollouts of a scene [m]")[0]
+    figure = figures(page, "spread of the rollouts of a scene [m]")[0]
     line = trace(figure, "DPA-OMF")
     assert line["x"] == sorted(line["x"])
     place = line["marker"]["size"].index(max(line["marker"]["size"]))

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from dpa.report.statistics import SEEDS_AND_SCENES as OVER
 from dpa.report.table import cells, header, print_table, summarise, to_markdown
 
 
@@ -74,11 +75,11 @@ def test_nan_is_refused_with_method_and_measure(comparison: dict[str, Any]) -> N
 @pytest.mark.parametrize("entry", [{"method": "reference"}, {"method": "nobody"}, {"method": "DPA-OMF", "top_p": 0.5}])
 def test_a_difference_that_fits_no_single_row_is_refused(entry: dict[str, Any], comparison: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=entry["method"]):
-        summarise(comparison["rows"], [{**entry, "realism_difference": 0.0, "ci95": [0.0, 0.0]}])
+        summarise(comparison["rows"], [{**entry, "realism_difference": 0.0, "ci95": [0.0, 0.0], "over": OVER}])
 
 
 def test_a_difference_with_a_top_p_goes_to_that_row(comparison: dict[str, Any]) -> None:
-    entry = {"method": "reference", "top_p": 0.85, "realism_difference": 0.005, "ci95": [0.0, 0.01]}
+    entry = {"method": "reference", "top_p": 0.85, "realism_difference": 0.005, "ci95": [0.0, 0.01], "over": OVER}
     records = summarise(comparison["rows"], [entry])
     assert [record["realism_difference"] for record in records[:2]] == [None, 0.005]
 
@@ -88,7 +89,8 @@ def test_decodings_that_differ_in_temperature_alone_are_rows_of_their_own() -> N
         {"method": "reference", "seed": 0, "top_p": 0.9, "temperature": temperature, "realism": temperature / 2}
         for temperature in (1.0, 0.8)
     ]
-    sharper = {"method": "reference", "top_p": 0.9, "temperature": 0.8, "realism_difference": -0.1, "ci95": [-0.2, 0.0]}
+    where = {"method": "reference", "top_p": 0.9, "temperature": 0.8}
+    sharper = where | {"realism_difference": -0.1, "ci95": [-0.2, 0.0], "over": OVER}
     records = summarise(rows, [sharper])
     assert [(record["temperature"], record["realism"]) for record in records] == [(1.0, 0.5), (0.8, 0.4)]
     assert [record["realism_difference"] for record in records] == [None, -0.1]
