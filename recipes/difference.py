@@ -262,7 +262,7 @@ def _print(found: Sequence[Difference], method: str, other: str) -> None:
         seeds = f"{each.ahead} of {between.num_seeds}"
         numbers = (f"{each.mine:.4f}", f"{each.other:.4f}", change, seeds, str(between.num_scenes))
         table.add_row(each.measure, *numbers, style=None if between.verdict == "open" else "bold")
-    print_whole(table, Console())
+    print_whole(table, Console(markup=False))
 
 
 if __name__ == "__main__":

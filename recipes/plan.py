@@ -175,7 +175,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for part in parts:
         table.add_row(part.name, f"{part.hours:,.1f}", f"{part.gigabytes:,.1f}", f"{part.memory:.2f}", part.grows_with)
     table.add_row("all", f"{sum(p.hours for p in parts):,.1f}", f"{sum(p.gigabytes for p in parts):,.1f}", "", "")
-    Console(width=110).print(table)
+    Console(markup=False, width=110).print(table)
     if options.json is not None:
         write_json(options.json, {"rates": rates, "parts": [part._asdict() for part in parts]})
     return 0

@@ -98,7 +98,7 @@ def main(cfg: DictConfig) -> None:
         feature = FEATURES[row.feature]
         numbers = (f"{row.spread:.3g}", f"{row.paper:.1%}", f"{row.normalised:.1%}")
         table.add_row(row.feature, feature.unit, f"{feature.weight:g}", *numbers)
-    Console(width=100).print(table)
+    Console(markup=False, width=100).print(table)
     if cfg.json is not None:
         write_json(cfg.json, [row._asdict() for row in rows])
 

@@ -86,7 +86,7 @@ def main(cfg: DictConfig) -> None:
     table = Table("agents", "poses", "position mean [m]", "p99 [m]", "heading mean [deg]", "speed mean [m/s]")
     for name, row in errors.items():
         table.add_row(name, *(f"{value:.3f}" if isinstance(value, float) else str(value) for value in row.values()))
-    Console().print(table)
+    Console(markup=False).print(table)
     if cfg.json is not None:
         write_json(cfg.json, {"tokenizer": plain(cfg.model.tokenizer), "scenes": len(scenes), "errors": errors})
 

@@ -409,7 +409,8 @@ def test_the_tables_of_a_study_of_rankings_are_those_of_the_values_of_its_scenes
         for ranking in spurious.RANKINGS:
             ends = (summary["realism"][ranking][end]["realism"] for end in ("best", "worst"))
             assert " | ".join(in_a_cell(end, 3) for end in ends) in told
-    (options,) = re.findall(rf"^ +python -m recipes\.{name} (.* output=runs/study/{name})$", told, re.MULTILINE)
+    runs = {"sumo": "study", "gpudrive": "real"}[summary["made"]["config"]["scenes"]["source"]]
+    (options,) = re.findall(rf"^ +python -m recipes\.{name} (.* output=runs/{runs}/{name})$", told, re.MULTILINE)
     with initialize_config_dir(str(CONFIG), version_base="1.3"):
         given = OmegaConf.to_container(compose(name, shlex.split(options)), resolve=True)
     made = summary["made"]["config"]

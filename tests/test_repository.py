@@ -119,6 +119,16 @@ def test_the_search_for_unsafe_calls_finds_them(code: str, unsafe: bool) -> None
     assert (unsafe_call(ast.parse(code, mode="eval").body) is not None) == unsafe
 
 
+def test_units_in_brackets_are_printed_and_not_taken_for_markup() -> None:
+    consoles = [
+        f"{name}: {call}"
+        for name, text, _ in modules()
+        for call in re.findall(r"\bConsole\([^)]*\)", text)
+        if name.startswith(PACKAGES)
+    ]
+    assert consoles and not [call for call in consoles if "markup=False" not in call], "rich would swallow [m]"
+
+
 def test_every_module_says_what_it_is() -> None:
     assert not [name for name, text, tree in modules() if text.strip() and not ast.get_docstring(tree)]
 

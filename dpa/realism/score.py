@@ -106,7 +106,7 @@ def _print(content: dict[str, Any]) -> None:
     for name, value in (content["buckets"] | content["metrics"]).items():
         bounds = content["interval_95"].get(name)
         table.add_row(name, f"{value:.6f}", "" if bounds is None else f"[{bounds[0]:.4f}, {bounds[1]:.4f}]")
-    Console(width=110).print(table)
+    Console(markup=False, width=110).print(table)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -207,7 +207,7 @@ def print_table(
         title: above the table.
         console: where to print; standard output by default.
     """
-    print_whole(to_rich(rows, paired, title=title), console or Console())
+    print_whole(to_rich(rows, paired, title=title), console or Console(markup=False))
 
 
 def print_whole(table: Table, console: Console) -> None:

@@ -41,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 values[name].append(value)
     for name, known in values.items():
         mean = f"{sum(known) / len(known):.4f}" if known else "–"
-        Console(width=100).print(f"{name:12} {mean:>8}  of {len(known)} scenes", highlight=False)
+        Console(markup=False, width=100).print(f"{name:12} {mean:>8}  of {len(known)} scenes", highlight=False)
 
 
 if __name__ == "__main__":

@@ -139,7 +139,7 @@ def _print(rows: list[dict[str, Any]], options: dict[str, Any]) -> None:
     for row in rows:
         numbers = [f"{row[key]:.3f}" for key in ("seconds", "slowest", "memory_gib", "process_gib")]
         table.add_row(row["case"], str(row["agents"]), str(row["evaluated"]), *numbers)
-    Console(width=110).print(table)
+    Console(markup=False, width=110).print(table)
 
 
 def add_options(part: argparse.ArgumentParser) -> None:

@@ -147,7 +147,7 @@ def measure(options: dict[str, Any]) -> list[dict[str, Any]]:
     if grown:
         _print(rows[len(cases) :], "growth")
     limit = _limit(main, rows[0])
-    Console(width=110).print(_facts(rows, limit))
+    Console(markup=False, width=110).print(_facts(rows, limit))
     return [*rows, limit]
 
 
@@ -256,7 +256,7 @@ def _print(rows: list[dict[str, Any]], title: str) -> None:
         table.add_row(
             row["how"], *sizes, f"{row['seconds']:.2f}", f"{row['agent_steps_per_second']:,.0f}", f"{row['gib']:.2f}"
         )
-    Console(width=110).print(table)
+    Console(markup=False, width=110).print(table)
 
 
 def _facts(rows: list[dict[str, Any]], limit: dict[str, float]) -> str:

@@ -59,7 +59,7 @@ def measure(options: dict[str, Any]) -> list[dict[str, Any]]:
     table = Table("", "figure", title=f"scenes of {source.name}, {len(store)} in all", title_justify="left")
     for row in rows:
         table.add_row(row["what"], f"{row['figure']:,.{row['digits']}f} {row['unit']}")
-    Console(width=110).print(table)
+    Console(markup=False, width=110).print(table)
     return rows
 
 

@@ -204,7 +204,7 @@ def _print(rows: list[dict[str, Any]], problems: int, options: dict[str, Any]) -
     for row in cases:
         figures = f"{row['problems_per_second']:,.0f}", f"{row['times_the_loop']:.2f}", f"{row['spearman']:.4f}"
         table.add_row(row["how"], f"{row['seconds']:.3f}", f"{row['cpu_seconds']:.3f}", *figures)
-    console = Console(width=110)
+    console = Console(markup=False, width=110)
     console.print(table)
     console.print(
         f"whole ranking of {ranking['rollouts']} rollouts x {ranking['agents']} agents x 80 steps, "

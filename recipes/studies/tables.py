@@ -94,7 +94,7 @@ def _print(table: StudyTable) -> None:
     shown = rich_table.Table(*table.columns, title=table.title)
     for row in table.printed():
         shown.add_row(*row)
-    Console(width=190 if len(table.columns) > 5 else 140).print(shown)
+    Console(markup=False, width=190 if len(table.columns) > 5 else 140).print(shown)
 
 
 def _as_name(title: str) -> str:

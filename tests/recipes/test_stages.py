@@ -1025,6 +1025,7 @@ def test_the_spread_is_the_distance_of_last_positions_from_their_mean() -> None:
 def test_the_loss_of_tokenization_is_measured(run: Callable, options: Callable, tmp_path: Path) -> None:
     outcome = run("tokens", *options("tokens", f"json={tmp_path / 'tokens.json'}"))
     assert outcome.status == 0, outcome.err
+    assert "[m]" in outcome.out and "[deg]" in outcome.out
     errors = json.loads((tmp_path / "tokens.json").read_text())["errors"]
     assert errors["vehicle all"]["position_mean"] < 0.2
     assert errors["pedestrian all"] == {"poses": 0}
