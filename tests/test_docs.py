@@ -270,7 +270,7 @@ def test_pictures_of_the_documents_are_small() -> None:
 
 
 SPLITS = ("train", "tune", "eval")
-WITH_SAFETY = {FIRST, "fresh", "fresh_variant", "variants", "losses", "rounds"}
+WITH_SAFETY = {FIRST, "fresh", "fresh_variant", "real_variant", "variants", "losses", "rounds"}
 """Experiments whose table of safety the page of results has."""
 SHOWN = ("kinematic", "interactive", "map_based", "realism", "collision_rate", "offroad_rate")
 """Measures in README's table."""
