@@ -76,6 +76,7 @@ def couple_agent(distance: PreferenceDistance, scene: Scene, trajectory: Tensor,
         ValueError: the log has no valid step for the agent, so nothing is coupled.
 
     Examples:
+        >>> from dpa.ranking import log_trajectory
         >>> from envs.sources.synthetic import straight_road
         >>> scene = straight_road(2, speed=10.0)
         >>> log = log_trajectory(scene, 80)
@@ -148,6 +149,7 @@ def agent_name(scene: Scene, agent: int) -> str:
         agent: row among the present agents.
 
     Examples:
+        >>> from dpa.ranking import log_trajectory
         >>> from envs.sources.synthetic import straight_road
         >>> agent_name(straight_road(2), 1)
         'agent 1 (vehicle, id 2)'

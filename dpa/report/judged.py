@@ -98,6 +98,7 @@ def judge_rollouts(
         ValueError: a likelihood that is no number, or a scene without road edges.
 
     Examples:
+        >>> from dpa.ranking import log_trajectory
         >>> from envs.sources.synthetic import straight_road
         >>> scene = straight_road(2)
         >>> log = log_trajectory(scene, 80)
@@ -170,6 +171,7 @@ def mishaps(scene: Scene, trajectories: Tensor) -> tuple[Tensor, Tensor]:
         ValueError: the scene has no road edges.
 
     Examples:
+        >>> from dpa.ranking import log_trajectory
         >>> from envs.sources.synthetic import straight_road
         >>> scene = straight_road(2)
         >>> log = log_trajectory(scene, 80)[None]
@@ -213,6 +215,7 @@ def couple(distance: PreferenceDistance, scene: Scene, trajectories: Tensor, age
         agents: ``[E]`` int64, rows to couple.
 
     Examples:
+        >>> from dpa.ranking import log_trajectory
         >>> from envs.sources.synthetic import straight_road
         >>> scene = straight_road(2)
         >>> coupled = couple(PreferenceDistance(), scene, log_trajectory(scene, 80)[None], torch.arange(2))

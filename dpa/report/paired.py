@@ -27,16 +27,12 @@ def scene_values(groups: Sequence[Rows], figures: Sequence[str], evaluations: Ev
     Returns:
         ``[figures, groups, seeds, scenes]`` over the scenes where all rows have all values; None where a file, a seed
         or a figure is missing, numbers of scenes differ, or no scene is left.
-
-    Raises:
-        ValueError: two files are of other scenes, as where two studies were put into one folder.
     """
     seeds = [row["seed"] for row in groups[0]]
     files = [{row["seed"]: row["file"] for row in rows} for rows in groups]
     if not seeds or any(seed not in each for each in files for seed in seeds):
         return None
     found = [[evaluations(each[seed]) for seed in seeds] for each in files]
-    _check_scenes([each[seed] for each in files for seed in seeds], evaluations)
     if any(scenes is None or key not in scenes for runs in found for scenes in runs for key in figures):
         return None
     if len({len(scenes[key]) for runs in found for scenes in runs for key in figures}) != 1:
@@ -44,17 +40,6 @@ def scene_values(groups: Sequence[Rows], figures: Sequence[str], evaluations: Ev
     values = np.array([[[scenes[key] for scenes in runs] for runs in found] for key in figures], dtype=float)
     values = values[..., ~np.isnan(values).any((0, 1, 2))]
     return values if values.shape[-1] else None
-
-
-def _check_scenes(files: Sequence[str], evaluations: Evaluations) -> None:
-    known = {file: scenes for file in files if (scenes := evaluations.scenes(file)) is not None}
-    first = next(iter(known), None)
-    for file, scenes in known.items():
-        if scenes != known[first]:
-            raise ValueError(
-                f"{evaluations.folder / first} and {evaluations.folder / file} are of other scenes, so that nothing "
-                "can be paired; keep each study, and each archive of one, in a folder of its own."
-            )
 
 
 def paired_values(mine: Rows, base: Rows, key: str, evaluations: Evaluations) -> NDArray | None:

@@ -10,7 +10,7 @@ from typing import Any
 
 from dpa.preferences.card import DataCard
 from dpa.report.cards import read_preference_cards
-from dpa.report.experiment import Experiment, read_experiment, read_json
+from dpa.report.experiment import REPORTED, Experiment, read_experiment, read_json
 from dpa.report.scenes import SceneCard, read_scene_cards
 
 STUDIES = ("validity", "sensitivity", "discriminator")
@@ -98,30 +98,36 @@ class Evaluations:
     """Figures of every scene, from the files behind the rows; each file is read once.
 
     Args:
-        folder: of the study.
+        folder: of the study, all of whose files of a split are of the same scenes.
     """
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
-        self._read: dict[str, dict[str, Any]] = {}
+        self._read: dict[str, dict[str, list[float | None]] | None] = {}
+        self._scenes: dict[str, tuple[Path, list[str]]] = {}
 
     def __call__(self, file: str) -> Mapping[str, list[float | None]] | None:
         """Values of each scene by figure; None if the file is not in the folder.
 
         Raises:
-            ValueError: the file is no result of an evaluation.
+            ValueError: the file is no result of an evaluation, or of other scenes than another one of its split, as
+                where two studies were put into one folder.
         """
-        return self._content(file)["per_scene"]
-
-    def scenes(self, file: str) -> list[str] | None:
-        """Names of the scenes, in order; None if the file is not in the folder or does not tell."""
-        return self._content(file).get("scenes")
-
-    def _content(self, file: str) -> dict[str, Any]:
         if file not in self._read:
             path = self.folder / file
             content = read_json(path) if path.is_file() else {"per_scene": None}
             if not isinstance(content, dict) or "per_scene" not in content:
                 raise ValueError(f"{path} has no 'per_scene'; it is no result of an evaluation.")
-            self._read[file] = {name: content.get(name) for name in ("per_scene", "scenes")}
+            if "scenes" in content:
+                self._check_scenes(path, content["scenes"])
+            self._read[file] = content["per_scene"]
         return self._read[file]
+
+    def _check_scenes(self, path: Path, scenes: list[str]) -> None:
+        split = next((name for name in REPORTED if name in path.stem.split("_")), "")
+        first, known = self._scenes.setdefault(split, (path, scenes))
+        if scenes != known:
+            raise ValueError(
+                f"{first} and {path} are of other scenes, so that nothing can be paired; keep each study, and each "
+                "archive of one, in a folder of its own."
+            )
