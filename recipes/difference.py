@@ -234,12 +234,10 @@ def main() -> None:
 def _of_experiment(given: argparse.Namespace) -> Iterator[Difference]:
     if len(given.at) > 2:
         raise ValueError(f"--at takes one decoding for both, or one of each, got {len(given.at)}.")
-    name, _, other = given.other.rpartition(":")
-    sides = (
-        Side(_read(given.runs, given.experiment), given.method),
-        Side(_read(given.runs, name or given.experiment), other),
-    )
-    return differences(*sides, Evaluations(given.runs), given.at)
+    side = Side(_read(given.runs, given.experiment), given.method)
+    name, _, method = given.other.rpartition(":")
+    other = Side(_read(given.runs, name) if name else side.experiment, method)
+    return differences(side, other, Evaluations(given.runs), given.at)
 
 
 def _read(runs: Path, name: str) -> Experiment:

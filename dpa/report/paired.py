@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dpa.report.markup import Html, quiet
+from dpa.report.markup import Html, html, quiet, stacked
 from dpa.report.statistics import Interval, paired_bootstrap
 from dpa.report.study import Evaluations
+from dpa.report.table import MISSING
 
 Rows = Sequence[Mapping[str, Any]]
 """Rows of a method at one decoding, one for each seed, with their ``file``."""
@@ -57,3 +58,8 @@ def paired_figure(mine: Rows, base: Rows, key: str, evaluations: Evaluations) ->
 def quiet_change(found: Interval | None, digits: int = 3) -> Html:
     """A difference below the value that it belongs to; nothing where there is none."""
     return Html("") if found is None else quiet(found.mean, (found.low, found.high), found.over, digits)
+
+
+def stacked_change(found: Interval | None) -> Html:
+    """A difference above its interval, for a column of its own; a dash where there is none."""
+    return html(MISSING) if found is None else stacked(found.mean, (found.low, found.high), found.over)

@@ -53,12 +53,15 @@ def merged(made: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         >>> one = {"revision": "a1", "machine": "here", "date": "2026-11-23", "versions": {"torch": "2.13.0"}}
         >>> merged([one, one | {"revision": None, "date": "2026-11-24"}])["revision"]
         'a1, none'
+        >>> merged([one | {"revision": None}])["revision"] is None  # outside a checkout, as :func:`provenance` says it
+        True
         >>> merged([one, one | {"date": "2026-11-24"}])["date"]
         '2026-11-23 to 2026-11-24'
     """
 
-    def told(values: Iterable[Any]) -> str:
-        return ", ".join(dict.fromkeys("none" if value is None else str(value) for value in values))
+    def told(values: Iterable[str | None]) -> str | None:
+        each = dict.fromkeys(values)
+        return None if each.keys() == {None} else ", ".join("none" if value is None else value for value in each)
 
     names = dict.fromkeys(name for each in made for name in each["versions"])
     dates = sorted({each["date"] for each in made})

@@ -100,7 +100,7 @@ class Sinkhorn:
             done = done | (error <= self.tolerance)
             if bool(done.all()):
                 break
-        if not bool(done.all()):
+        else:
             warnings.warn(
                 f"sinkhorn left couplings further than tolerance={self.tolerance:g} from their marginals after "
                 f"iterations={self.iterations}; allow more of these, or a larger epsilon than {self.epsilon:g}.",

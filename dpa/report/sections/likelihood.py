@@ -12,11 +12,10 @@ from dpa.report.charts import Chart, Line, curves, gallery
 from dpa.report.curves import Curve, read_curves
 from dpa.report.experiment import Experiment
 from dpa.report.likelihoods import ABOUT_LEARNT, LEARNT, Cell, Learnt, likelihoods, shown_figures, who_learns
-from dpa.report.markup import Html, Section, element, folded, hint, html, joined, sources, stacked, table
-from dpa.report.paired import quiet_change
-from dpa.report.statistics import Interval
+from dpa.report.markup import Html, Section, element, folded, hint, joined, sources, table
+from dpa.report.paired import quiet_change, stacked_change
 from dpa.report.study import Evaluations
-from dpa.report.table import MISSING, REFERENCE, number
+from dpa.report.table import REFERENCE, number
 
 SIDES = {
     "tune/nll_preferred": ("preferred", "#2a78b5"),
@@ -84,14 +83,10 @@ def _table_3(learnt: Learnt, experiment: Experiment) -> Html:
         values = (number(cell.mean, cell.digits) for cell in cells)
         rows.append([name, *(joined(each, "") for each in zip(values, papers, strict=True))])
     for name, changes in learnt.changes.items():
-        rows.append([name, *(_stacked(change) for change in changes)])
+        rows.append([name, *(stacked_change(change) for change in changes)])
     note = f"On {experiment.reported}; {ABOUT_LEARNT}. Differences with 95 % intervals, bold where 0 lies outside."
     head = element("h3", "Who learns the ranking (table 3)")
     return joined([head, table(["method", *LEARNT.values()], rows), hint(note)])
-
-
-def _stacked(change: Interval | None) -> Html:
-    return html(MISSING) if change is None else stacked(change.mean, (change.low, change.high), change.over)
 
 
 def training_section(

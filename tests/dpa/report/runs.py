@@ -54,6 +54,8 @@ STAGES = {
     "align": {f"align {job}": 200.0 for job in range(9)},
 }
 """Seconds of each job."""
+ROLLED = {"decoding": {"num_rollouts": 4}, "evaluation": {"num_rollouts": 8}}
+"""Of a configuration what every experiment has."""
 
 
 def write_runs(folder: Path) -> Path:
@@ -106,8 +108,7 @@ def write_experiment(
         "budget": {m: {"steps": 60, "rollouts": 960, "start": "reference"} for m in others if "@" not in m},
         "stages": {"pretrain": 5400.0, "align": 125.0}, "worker_seconds": 5525.0,
         "config": {
-            "mark": "<!--{title}-->", "methods": {"dpa_omf": {"loss": DPO}},
-            "decoding": {"num_rollouts": 4}, "evaluation": {"num_rollouts": 8},
+            "mark": "<!--{title}-->", "methods": {"dpa_omf": {"loss": DPO}}, **ROLLED,
         },
         "revision": "0123abc", "versions": {"torch": "2.13.0"},
         "machine": "Linux x86_64, 2 CPU cores", "date": "2026-11-21",

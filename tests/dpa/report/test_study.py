@@ -23,7 +23,7 @@ from dpa.report.table import difference, number, signed
 from recipes import report as recipe
 from recipes.report import report
 from tests.dpa.report.parsed import Page
-from tests.dpa.report.runs import AXIS, BEST, COMMON, GRID, SEEDS, label, values, write, write_experiment
+from tests.dpa.report.runs import AXIS, BEST, COMMON, GRID, ROLLED, SEEDS, label, values, write, write_experiment
 
 
 @pytest.fixture(scope="module")
@@ -186,10 +186,6 @@ def test_red_lights_stand_apart_where_the_metric_weighs_them(copied: Path, tmp_p
 def safety(page: Page, title: str) -> list[str]:
     """Titles of the first table whose second column is this."""
     return next(rows[0] for rows in page.tables if clean(rows[0][1]) == title)
-
-
-ROLLED = {"decoding": {"num_rollouts": 4}, "evaluation": {"num_rollouts": 8}}
-"""Of a configuration what every experiment has."""
 
 
 def change(runs: Path, name: str, **changes: Any) -> None:
