@@ -93,6 +93,34 @@ def drop_agents(scene: Scene, drop: Tensor) -> Scene:
 
 
 @dataclass(frozen=True)
+class Change:
+    """What was drawn for a scene.
+
+    Attributes:
+        mirrored: the scene is mirrored.
+        angle: that it is turned by [rad].
+        drop: ``[A]`` bool, who is left out unless it has to stay (:func:`drop_agents`).
+    """
+
+    mirrored: bool
+    angle: float
+    drop: Tensor
+
+    @property
+    def only_mirrors(self) -> bool:
+        """Whether there is nothing beside the mirror: one of two variants of a scene, worth keeping."""
+        return self.angle == 0 and not self.drop.any()
+
+    def __call__(self, scene: Scene) -> Scene:
+        """The changed scene; the one that is given stays as it is, and what does not change may be shared with it."""
+        if self.drop.any():
+            scene = drop_agents(scene, self.drop)
+        if self.mirrored:
+            scene = mirror(scene)
+        return rotate(scene, self.angle) if self.angle else scene
+
+
+@dataclass(frozen=True)
 class Augmentation:
     """How scenes are changed at random, each time that they are shown; by default not at all.
 
@@ -126,19 +154,12 @@ class Augmentation:
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is a probability and must lie in [0, 1], got {getattr(self, name)}.")
 
-    def __call__(self, scene: Scene, generator: torch.Generator) -> Scene:
-        """One variant of a scene, which itself stays as it is; what does not change may be shared with it.
-
-        Args:
-            scene: an uncollated scene.
-            generator: on the CPU.
-        """
+    def draw(self, num_agents: int, generator: torch.Generator) -> Change:
+        """What happens to a scene of so many agents; ``generator`` is on the CPU."""
         turn, flip = torch.rand(2, generator=generator).tolist()
-        drop = torch.rand(len(scene.agents.sdc), generator=generator) < self.agent_drop
-        if drop.any():
-            scene = drop_agents(scene, drop)
-        if flip < self.mirror:
-            scene = mirror(scene)
-        if self.rotation > 0:
-            scene = rotate(scene, (2 * turn - 1) * self.rotation)
-        return scene
+        drop = torch.rand(num_agents, generator=generator) < self.agent_drop
+        return Change(flip < self.mirror, (2 * turn - 1) * self.rotation, drop)
+
+    def __call__(self, scene: Scene, generator: torch.Generator) -> Scene:
+        """One variant of an uncollated scene, as :meth:`draw` and :class:`Change` have it."""
+        return self.draw(len(scene.agents.sdc), generator)(scene)

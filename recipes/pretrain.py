@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import hydra
@@ -21,8 +20,9 @@ from tensordict import TensorDict
 
 from dpa.losses import NextTokenLoss, token_network
 from dpa.policy import MotionLM
-from dpa.training.batches import Item, LogReader, collate_items, micro_batches, with_tokens
+from dpa.training.batches import Item, collate_items, micro_batches
 from dpa.training.distributed import ALONE, Ranks, join_ranks
+from dpa.training.logs import LogItems
 from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
 from dpa.training.run import Run
 from dpa.training.seeding import seed_everything
@@ -37,7 +37,7 @@ from recipes.common.cli import CONFIG, build, check_steps, deciding, finished, r
 from recipes.common.models import build_policy, check_written, context_options, policy_config, write_policy
 from recipes.common.scenes import Splits, fingerprint, open_splits
 
-OBSERVING = ("checkpoint_interval", "max_rows", "workers")
+OBSERVING = ("checkpoint_interval", "max_rows", "workers", "keep_gib")
 """Options of the section ``pretraining`` that change nothing about the policy."""
 
 
@@ -73,9 +73,8 @@ def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path, ranks: Ra
     device = ranks.place(cfg.device)
     model = build_policy(config).to(device)
     best = copy.deepcopy(model)
-    read = log_reader(cfg, model)
-    train = training_items(splits.train, options, read, seed, ranks)
-    tune = log_items(splits.tune, replace(read, augment=Augmentation(), noise=0.0), ranks)
+    train = training_items(cfg, splits.train, model, seed, ranks)
+    tune = tuning_items(cfg, splits.tune, model, ranks)
     loss = NextTokenLoss(token_network(model), label_smoothing=options.label_smoothing)
     loss.set_keys(labels=keys.LABELS)
     loss = ranks.wrap(loss)
@@ -126,28 +125,26 @@ def parts_of(items: list[Item], max_rows: int, device: str, ranks: Ranks = ALONE
         yield collate_items([items[i] for i in part]).to(device), share
 
 
-def log_reader(cfg: DictConfig, model: MotionLM) -> LogReader:
-    """What turns a scene into a training item, as the options say."""
+def training_items(
+    cfg: DictConfig, scenes: SceneSource, model: MotionLM, seed: int, ranks: Ranks = ALONE
+) -> SceneLoader:
+    """Lists of tokenized logs for this rank, read as they are needed: what is kept of them is bounded."""
     options = cfg.pretraining
-    return LogReader(
-        tokenizer=copy.deepcopy(model.tokenizer).cpu(),
-        options=context_options(cfg.model),
+    logs = LogItems(
+        scenes,
+        copy.deepcopy(model.tokenizer).cpu(),
+        context_options(cfg.model),
         augment=build(Augmentation, options.augmentation, "pretraining.augmentation"),
         noise=options.noise,
         max_agents=options.max_agents,
+        keep_gib=options.keep_gib,
     )
-
-
-def training_items(
-    scenes: SceneSource, options: DictConfig, read: LogReader, seed: int, ranks: Ranks = ALONE
-) -> SceneLoader:
-    """Lists of tokenized logs for this rank, read as they are needed: memory does not grow with the scenes."""
     return SceneLoader(
-        scenes,
+        logs,
         ranks.share_of(options.batch_size, "pretraining.batch_size"),
         seed=seed,
-        prepare=read,
-        collate=with_tokens,
+        prepare=logs.prepare,
+        collate=logs.collate,
         rank=ranks.rank,
         world_size=ranks.world_size,
         workers=options.workers,
@@ -155,14 +152,16 @@ def training_items(
     )
 
 
-def log_items(scenes: SceneSource, read: LogReader, ranks: Ranks = ALONE) -> list[Item]:
+def tuning_items(cfg: DictConfig, scenes: SceneSource, model: MotionLM, ranks: Ranks = ALONE) -> list[Item]:
     """This rank's part of the tokenized logs of a few scenes, always the same."""
+    options = context_options(cfg.model)
+    logs = LogItems(scenes, copy.deepcopy(model.tokenizer).cpu(), options, max_agents=cfg.pretraining.max_agents)
     bar = progress(ranks.mine(range(len(scenes))), "tokens", unit="scene", disable=not ranks.main)
-    items = with_tokens([read(scenes[index], make_generator(0, "tune", index)) for index in bar])
+    items = logs.collate([logs.prepare(index, make_generator(0, "tune", index)) for index in bar])
     if not ranks.sum(torch.tensor(sum(int(item.token_valid.sum()) for item in items))):
         raise ValueError(
             f"none of the {len(scenes)} tuning scenes has a token to predict: no agent that the policy controls "
-            f"(model.context.control={read.options.control}) has a log after the current step; say "
+            f"(model.context.control={options.control}) has a log after the current step; say "
             "model.context.control=all, or name other scenes.tune."
         )
     return items

@@ -9,6 +9,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictParams, dispatch
 from torch import Tensor
+from torch.nn.functional import cross_entropy
 from torchrl.objectives import LossModule
 
 from dpa.losses.network import CONTEXT, hold_network, logits_under, masked_mean, token_entropy
@@ -101,10 +102,11 @@ class NextTokenLoss(LossModule):
             batch_size=tokens.shape[:1],
         )
         logits = logits_under(self.actor_network_params, self.actor_network, batch)
-        log_probs, labels = logits.log_softmax(-1), tensordict[accepted.labels]
-        nll = -log_probs.gather(-1, labels[..., None])[..., 0]
-        spread = -log_probs.mean(-1)
-        loss = masked_mean((1 - self.label_smoothing) * nll + self.label_smoothing * spread, valid)
+        labels = tensordict[accepted.labels]
+        each = cross_entropy(
+            logits.flatten(0, -2), labels.flatten(), reduction="none", label_smoothing=self.label_smoothing
+        )
+        loss = masked_mean(each.view_as(labels), valid)
         with torch.no_grad():
             hit = (logits.argmax(-1) == labels).to(logits.dtype)
             entropy = masked_mean(token_entropy(logits), valid)

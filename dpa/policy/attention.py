@@ -22,14 +22,18 @@ from envs.geometry.frames import rotate
 
 METRES = 10.0
 """Metres that count as one in the matrices."""
+GAZE = 4
+"""Channels after those of a head: three of its gaze, and a zero, since fused attention likes multiples of four."""
+DECISIONS = 4
+"""Decisions that attend at a time where all are given: later nodes, which none of them may see, are left out."""
 
 
 class KeyValues(NamedTuple):
     """Keys and values of tokens, in the frame of the scene.
 
     Attributes:
-        keys: ``[B, H, n, D + 3]``.
-        values: ``[B, H, n, D + 3]``, the last three 0: fused attention wants keys and values of one width.
+        keys: ``[B, H, n, D + GAZE]``.
+        values: ``[B, H, n, D + GAZE]``, the last ones 0: fused attention wants keys and values of one width.
     """
 
     keys: Tensor
@@ -41,11 +45,21 @@ class NodeMasks(NamedTuple):
 
     Attributes:
         own: broadcastable to ``[B * A, 1, decisions, remembered decisions]`` bool, along the own past.
-        everybody: broadcastable to ``[B, 1, m, n]`` bool.
+        everybody: broadcastable to ``[B, 1, m, n]``, added to the scores (:func:`added`): nothing of a later decision.
     """
 
     own: Tensor
     everybody: Tensor
+
+
+def added(mask: Tensor) -> Tensor:
+    """A mask that is true where one may look, as what is added to scores: made once, it serves all layers.
+
+    Examples:
+        >>> added(torch.tensor([True, False]))
+        tensor([0., -inf])
+    """
+    return torch.zeros(mask.shape, device=mask.device).masked_fill(~mask, -torch.inf)
 
 
 class RelativeAttention(nn.Module):
@@ -86,7 +100,7 @@ class RelativeAttention(nn.Module):
         key, value = self._split(self.key_value(x), 2)
         pose = pose[:, None]
         xy = (pose[..., :2] / METRES).expand(*key.shape[:-1], 2)
-        window = torch.cat((xy, -(xy[..., :1] ** 2 + xy[..., 1:] ** 2) / 2), -1)
+        window = torch.cat((xy, -(xy[..., :1] ** 2 + xy[..., 1:] ** 2) / 2, torch.zeros_like(xy[..., :1])), -1)
         return KeyValues(self._move(key, pose, window), self._move(value, pose, torch.zeros_like(window)))
 
     def forward(self, x: Tensor, pose: Tensor, memory: KeyValues, mask: Tensor | None = None) -> Tensor:
@@ -96,7 +110,7 @@ class RelativeAttention(nn.Module):
             x: ``[B, m, width]`` queries.
             pose: ``[B, m, 3]``.
             memory: of n tokens.
-            mask: broadcastable to ``[B, H, m, n]`` bool, true where a query may look.
+            mask: broadcastable to ``[B, H, m, n]``: bool, true where a query may look, or :func:`added` to the scores.
 
         Returns:
             ``[B, m, width]``.
@@ -105,7 +119,7 @@ class RelativeAttention(nn.Module):
         return self._merge(seen, pose)
 
     def _queries(self, x: Tensor, pose: Tensor) -> Tensor:
-        """``[B, H, m, D + 3]``."""
+        """``[B, H, m, D + GAZE]``."""
         (query,) = self._split(self.query(x), 1)
         pose = pose[:, None]
         return self._query(query, pose, self._gaze(x, pose))
@@ -117,7 +131,7 @@ class RelativeAttention(nn.Module):
             return F.scaled_dot_product_attention(query, memory.keys, memory.values, attn_mask=mask, scale=1.0)
 
     def _merge(self, seen: Tensor, pose: Tensor) -> Tensor:
-        """Heads ``[B, H, m, D + 3]`` to ``[B, m, width]``, in the frames of the queries."""
+        """Heads ``[B, H, m, D + GAZE]`` to ``[B, m, width]``, in the frames of the queries."""
         return self.out(self._back(seen[..., : self.dim], pose[:, None]).transpose(1, 2).flatten(2))
 
     def _split(self, x: Tensor, parts: int) -> tuple[Tensor, ...]:
@@ -153,11 +167,11 @@ class RelativeAttention(nn.Module):
         return torch.cat((vector.flatten(-2), weight, rest), -1)
 
     def _gaze(self, x: Tensor, pose: Tensor) -> Tensor:
-        """``[B, H, m, 3]``: w * (c_x, c_y, 1) for a centre c in the scene's frame, in units of METRES."""
+        """``[B, H, m, GAZE]``: w * (c_x, c_y, 1, 0) for a centre c in the scene's frame, in units of METRES."""
         offset, width = self.gaze(x).float().unflatten(-1, (self.heads, 3)).transpose(1, 2).split((2, 1), -1)
         precision = self.precision[:, None, None] * METRES**2 * width.exp()
         centre = pose[..., :2] / METRES + rotate(offset, pose[..., 2])
-        return torch.cat((precision * centre, precision), -1)
+        return torch.cat((precision * centre, precision, torch.zeros_like(precision)), -1)
 
 
 class NodeAttention(RelativeAttention):
@@ -174,7 +188,7 @@ class NodeAttention(RelativeAttention):
         >>> attention = NodeAttention(32, heads=2)
         >>> x, pose = torch.randn(1, 6, 32), torch.randn(1, 6, 3)  # two agents, three decisions
         >>> own = torch.ones(3, 3, dtype=torch.bool).tril()
-        >>> masks = NodeMasks(own, own.repeat_interleave(2, 0).repeat_interleave(2, 1))
+        >>> masks = NodeMasks(own, added(own.repeat_interleave(2, 0).repeat_interleave(2, 1)[None, None]))
         >>> attention(x, pose, attention.remember(x, pose), masks, agents=2).shape
         torch.Size([1, 6, 32])
     """
@@ -201,9 +215,7 @@ class NodeAttention(RelativeAttention):
 
     @torch.compiler.disable  # torch 2.13 compiles attention over a part of the heads to wrong numbers on a CPU
     def _look(self, query: Tensor, memory: KeyValues, masks: NodeMasks, agents: int) -> Tensor:
-        """``[B, H, m, D + 3]``: the own past in the first heads, everybody in the rest."""
-        rest = KeyValues(memory.keys[:, self.own :], memory.values[:, self.own :])
-        everybody = self._attend(query[:, self.own :], rest, masks.everybody)
+        """``[B, H, m, D + GAZE]``: the own past in the first heads, everybody in the rest."""
 
         def by_agent(heads: Tensor) -> Tensor:
             """``[B, H, decisions * A, D]`` to ``[B * A, own, decisions, D]``."""
@@ -212,7 +224,20 @@ class NodeAttention(RelativeAttention):
         past = KeyValues(by_agent(memory.keys), by_agent(memory.values))
         own = self._attend(by_agent(query), past, masks.own)
         own = own.unflatten(0, (len(query), agents)).permute(0, 2, 3, 1, 4).flatten(2, 3)
-        return torch.cat((own, everybody), 1)
+        return torch.cat((own, self._everybody(query, memory, masks.everybody, DECISIONS * agents)), 1)
+
+    def _everybody(self, query: Tensor, memory: KeyValues, mask: Tensor, chunk: int) -> Tensor:
+        """What the other heads see: some decisions at a time where all are there, up to the last of each lot."""
+        keys, values = memory.keys[:, self.own :], memory.values[:, self.own :]
+        nodes, remembered = query.shape[2], keys.shape[2]
+        if nodes != remembered:
+            return self._attend(query[:, self.own :], KeyValues(keys, values), mask)
+        seen = []
+        for first in range(0, nodes, chunk):
+            last = min(first + chunk, nodes)
+            earlier = KeyValues(keys[:, :, :last], values[:, :, :last])
+            seen.append(self._attend(query[:, self.own :, first:last], earlier, mask[..., first:last, :last]))
+        return torch.cat(seen, 2)
 
 
 class FeedForward(nn.Sequential):

@@ -224,14 +224,25 @@ def _resample(points: Tensor, start: Tensor, end: Tensor) -> Tensor:
 def _light_poses(road: RoadMap, lights: Lights) -> Tensor:
     """``[G, 3]``: stop points, headed along the lane at its nearest point; 0 heading for a lane that the map lacks."""
     poses = torch.zeros(len(lights.lane_id), 3)
-    for light, lane in enumerate(lights.lane_id.tolist()):
-        listed = (lights.state[light, :HISTORY] != LightState.ABSENT).nonzero()
-        poses[light, :2] = lights.stop_point[light, int(listed[-1]) if len(listed) else LOG_STEPS - 1, :2]
-        owner = ((road.feature_id == lane) & (road.count > 1)).nonzero()
-        if len(owner):
-            first, count = int(road.start[owner[0]]), int(road.count[owner[0]])
-            line = road.points[first : first + count, :2]
-            nearest = int((line - poses[light, :2]).norm(dim=-1).argmin())
-            ahead = line[min(nearest + 1, count - 1)] - line[max(nearest - 1, 0)]
-            poses[light, 2] = wrap_angle(torch.atan2(ahead[1], ahead[0]))
+    if not len(poses):
+        return poses
+    listed = lights.state[:, :HISTORY] != LightState.ABSENT
+    latest = torch.where(listed.any(-1), HISTORY - 1 - listed.flip(-1).int().argmax(-1), LOG_STEPS - 1)
+    poses[:, :2] = lights.stop_point[torch.arange(len(poses)), latest, :2]
+    lane = (road.feature_id == lights.lane_id[:, None]) & (road.count > 1)
+    known = lane.any(-1)
+    if known.any():
+        owner = lane[known].int().argmax(-1)
+        poses[known, 2] = _lane_headings(road, owner, poses[known, :2])
     return poses
+
+
+def _lane_headings(road: RoadMap, owner: Tensor, places: Tensor) -> Tensor:
+    """``[n]``: heading of each place's polyline, ``owner``, which has two points or more, at its nearest point."""
+    first, last = road.start[owner], road.count[owner] - 1
+    along = torch.arange(int(last.max()) + 1)
+    points = road.points[(first[:, None] + along.minimum(last[:, None])), :2]
+    nearest = (points - places[:, None]).norm(dim=-1).masked_fill(along > last[:, None], torch.inf).argmin(-1)
+    rows = torch.arange(len(owner))
+    ahead = points[rows, (nearest + 1).minimum(last)] - points[rows, (nearest - 1).clamp(min=0)]
+    return wrap_angle(torch.atan2(ahead[:, 1], ahead[:, 0]))

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from dpa.policy.attention import FeedForward, KeyValues, NodeAttention, NodeMasks, RelativeAttention
+from dpa.policy.attention import GAZE, FeedForward, KeyValues, NodeAttention, NodeMasks, RelativeAttention, added
 from dpa.policy.encoder import LENGTH_SCALE, SceneTokens
 from dpa.policy.vicinity import Vicinity
 from envs.geometry.frames import rotate, wrap_angle
@@ -201,8 +201,8 @@ class NodeCache:
 
     def __init__(self, layers: int, shape: tuple[int, int, int, int], dim: int, like: Tensor) -> None:
         self.shape = shape
-        self.keys = [like.new_zeros(*shape, dim + 3) for _ in range(layers)]
-        self.values = [like.new_zeros(*shape, dim + 3) for _ in range(layers)]
+        self.keys = [like.new_zeros(*shape, dim + GAZE) for _ in range(layers)]
+        self.values = [like.new_zeros(*shape, dim + GAZE) for _ in range(layers)]
         batch, _, horizon, agents = shape
         self.valid = torch.zeros(batch, horizon, agents, dtype=torch.bool, device=like.device)
 
@@ -222,7 +222,7 @@ class NodeCache:
         self.valid[self._rows, step] = valid
         earlier = torch.arange(self._last, device=step.device) <= step[:, None]
         everybody = (self.valid[:, : self._last] & earlier[..., None]).flatten(1)[:, None, None, :]
-        return NodeMasks(earlier.repeat_interleave(valid.shape[1], 0)[:, None, None, :], everybody)
+        return NodeMasks(earlier.repeat_interleave(valid.shape[1], 0)[:, None, None, :], added(everybody))
 
     @torch.compiler.disable  # it grows by a decision at a time
     def add(self, layer: int, nodes: KeyValues) -> KeyValues:

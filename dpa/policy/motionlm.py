@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 import torch
 from torch import Tensor, nn
 
-from dpa.policy.attention import NodeMasks
+from dpa.policy.attention import NodeMasks, added
 from dpa.policy.context import SceneContext
 from dpa.policy.decoder import MotionDecoder, NodeInputs, SceneMemory
 from dpa.policy.encoder import SceneEncoder
@@ -120,7 +120,7 @@ class MotionLM(nn.Module):
         order = nodes.step[0]
         staircase = order[:, None] >= order
         own = torch.ones(horizon, horizon, dtype=torch.bool, device=tokens.device).tril()
-        masks = NodeMasks(own, (staircase & nodes.valid[:, None, :])[:, None])
+        masks = NodeMasks(own, added(staircase & nodes.valid[:, None, :])[:, None])
         logits = self.decoder(nodes, self.encode(context), masks)
         return logits.view(scenes, rollouts, horizon, agents, -1).transpose(2, 3)
 

@@ -61,8 +61,14 @@ class MotionTokenizer(nn.Module):
         """The motion of a token: ``[*, F, 3]`` poses in the agent's own current frame (arguments as in encode)."""
 
     @abstractmethod
-    def neighbour(self, token: Tensor, kind: Tensor, generator: torch.Generator | None) -> Tensor:
-        """A random token of nearly the same motion as each token ``[*]``, for noisy tokenization."""
+    def neighbour(self, token: Tensor, kind: Tensor, drawn: Tensor) -> Tensor:
+        """A random token of nearly the same motion as each token ``[*]``, for noisy tokenization.
+
+        Args:
+            token: ``[*]`` int64.
+            kind: ``[*]`` or what broadcasts to it.
+            drawn: ``[*, 2]`` uniform in [0, 1): what decides which neighbour.
+        """
 
     def encode_tracks(
         self,
@@ -72,7 +78,7 @@ class MotionTokenizer(nn.Module):
         kind: Tensor,
         *,
         noise: float = 0.0,
-        generator: torch.Generator | None = None,
+        drawn: Tensor | None = None,
     ) -> TokenizedTracks:
         """Tokenize tracks greedily on the reconstructed track, so that errors do not add up (method.md section 2).
 
@@ -88,7 +94,7 @@ class MotionTokenizer(nn.Module):
 
         Keyword Args:
             noise: probability with which a token is replaced.
-            generator: of the noise.
+            drawn: ``[*, A, T, 3]`` uniform in [0, 1), from which the noise is taken; needed only where there is any.
         """
         decisions = poses.unflatten(-2, (-1, self.steps))
         ends = valid.unflatten(-1, (-1, self.steps))[..., -1]
@@ -97,16 +103,13 @@ class MotionTokenizer(nn.Module):
         for step in range(decisions.shape[-3]):
             target = to_local(decisions[..., step, :, :], recent[..., -1:, :])
             labels.append(self.encode(target, recent, kind))
-            tokens.append(self._noisy(labels[-1], kind, noise, generator))
+            tokens.append(self._noisy(labels[-1], kind, noise, drawn[..., step, :]) if noise else labels[-1])
             recent = self.advance(tokens[-1], recent, kind)
             tracks.append(recent[..., 1:, :])
         return TokenizedTracks(torch.stack(tokens, -1), token_valid, torch.cat(tracks, -2), torch.stack(labels, -1))
 
-    def _noisy(self, token: Tensor, kind: Tensor, noise: float, generator: torch.Generator | None) -> Tensor:
-        if noise == 0:
-            return token
-        replaced = torch.rand(token.shape, generator=generator, device=token.device) < noise
-        return torch.where(replaced, self.neighbour(token, kind, generator), token)
+    def _noisy(self, token: Tensor, kind: Tensor, noise: float, drawn: Tensor) -> Tensor:
+        return torch.where(drawn[..., 0] < noise, self.neighbour(token, kind, drawn[..., 1:]), token)
 
     def decode_tracks(self, tokens: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
         """Poses of a row of tokens.

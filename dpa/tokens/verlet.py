@@ -102,11 +102,10 @@ class VerletTokenizer(MotionTokenizer):
         xy = self._interpolate(last, end)
         return torch.cat((xy, self._headings(xy, kind)[..., None]), -1)
 
-    def neighbour(self, token: Tensor, kind: Tensor, generator: torch.Generator | None) -> Tensor:
+    def neighbour(self, token: Tensor, kind: Tensor, drawn: Tensor) -> Tensor:
         """A change of at most one bin more or less in each direction."""
-        change = torch.stack((token // CHANGES, token % CHANGES), -1)
-        step = torch.randint(-1, 2, change.shape, generator=generator, device=token.device)
-        change = (change + step).clamp(0, CHANGES - 1)
+        change = torch.stack((token // CHANGES, token % CHANGES), -1) + (3 * drawn).long() - 1
+        change = change.clamp(0, CHANGES - 1)
         return change[..., 0] * CHANGES + change[..., 1]
 
     def _last_bins(self, recent: Tensor, kind: Tensor) -> Tensor:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple, Protocol, TypeVar
 
 import torch
@@ -11,11 +10,8 @@ from tensordict import TensorDict
 from torch import Tensor
 from torch.nn import functional as F
 
-from dpa.policy.context import ContextOptions, SceneContext, collate_contexts, keep_agents, make_context
-from dpa.tokens.base import MotionTokenizer
+from dpa.policy.context import SceneContext, collate_contexts
 from envs import keys
-from envs.augment import Augmentation
-from envs.scene import Scene
 from envs.seeding import make_generator
 
 
@@ -33,76 +29,6 @@ class Item(NamedTuple):
     tokens: Tensor
     token_valid: Tensor
     labels: Tensor | None = None
-
-
-def log_item(
-    context: SceneContext,
-    tokenizer: MotionTokenizer,
-    *,
-    noise: float = 0.0,
-    generator: torch.Generator | None = None,
-) -> Item:
-    """The log of a scene as one rollout (M = 1): what pre-training learns from (eq. 1).
-
-    Noise is that of :meth:`~dpa.tokens.MotionTokenizer.encode_tracks`.
-
-    Examples:
-        >>> from dpa.policy import make_context
-        >>> from dpa.tokens import VerletTokenizer
-        >>> from envs.sources.synthetic import straight_road
-        >>> log_item(make_context(straight_road(2)), VerletTokenizer()).tokens.shape
-        torch.Size([1, 2, 16])
-    """
-    tracks = tokenizer.encode_tracks(
-        context.logged, context.logged_valid, context.recent, context.kind, noise=noise, generator=generator
-    )
-    valid = tracks.valid & context.controlled[:, None]
-    return Item(context, tracks.tokens[None], valid, tracks.labels[None])
-
-
-@dataclass(frozen=True)
-class LogReader:
-    """Scene -> item for pre-training, with augmentation and noise drawn anew each time that the scene comes up.
-
-    A :class:`~envs.loader.SceneLoader` takes it as ``prepare``; it travels to the loader's workers.
-
-    Attributes:
-        tokenizer: on the CPU.
-        options: of :func:`~dpa.policy.make_context`.
-        augment: of scenes.
-        noise: see :func:`log_item`.
-        max_agents: see :func:`crop_agents`.
-
-    Examples:
-        >>> from dpa.policy import ContextOptions
-        >>> from dpa.tokens import VerletTokenizer
-        >>> from envs.sources.synthetic import straight_road
-        >>> read = LogReader(VerletTokenizer(), ContextOptions(), Augmentation(mirror=0.5), noise=0.0, max_agents=2)
-        >>> read(straight_road(3), torch.Generator().manual_seed(0)).tokens.shape
-        torch.Size([1, 2, 16])
-    """
-
-    tokenizer: MotionTokenizer
-    options: ContextOptions
-    augment: Augmentation
-    noise: float
-    max_agents: int
-
-    def __call__(self, scene: Scene, generator: torch.Generator) -> Item:
-        """The item of one scene."""
-        context = make_context(self.augment(scene, generator), self.options)
-        context = crop_agents(context, self.max_agents, generator)
-        return log_item(context, self.tokenizer, noise=self.noise, generator=generator)
-
-
-def crop_agents(context: SceneContext, limit: int, generator: torch.Generator) -> SceneContext:
-    """Keep the ``limit`` agents nearest to a random one, to bound the cost of a crowded scene."""
-    count = len(context.kind)
-    if count <= limit:
-        return context
-    xy = context.recent[:, -1, :2]
-    centre = xy[torch.randint(count, (), generator=generator)]
-    return keep_agents(context, (xy - centre).norm(dim=-1).argsort(stable=True)[:limit].sort().values)
 
 
 def collate_items(items: Sequence[Item]) -> TensorDict:

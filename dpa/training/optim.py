@@ -51,7 +51,7 @@ def make_optimizer(module: nn.Module, lr: float, weight_decay: float, betas: tup
     if not decayed and not spared:
         raise ValueError(f"{type(module).__name__} has no parameter that needs a gradient; unfreeze some of it.")
     groups = [{"params": decayed, "weight_decay": weight_decay}, {"params": spared, "weight_decay": 0.0}]
-    return AdamW([group for group in groups if group["params"]], lr=lr, betas=betas)
+    return AdamW([group for group in groups if group["params"]], lr=lr, betas=betas, fused=True)
 
 
 def make_schedule(

@@ -26,7 +26,7 @@ from dpa.preferences import (
     thin_out,
 )
 from dpa.tokens import MotionTokenizer
-from dpa.training.batches import log_item
+from dpa.training.logs import log_item
 from envs import keys
 from envs.scene import SceneSource
 from envs.seeding import make_generator

@@ -15,7 +15,7 @@ from dpa.policy.actor import Contexts
 from dpa.preferences import PreferenceStore, nearest_farthest
 from dpa.rollout import make_collector
 from dpa.tokens import MotionTokenizer
-from dpa.training.batches import log_item
+from dpa.training.logs import log_item
 from envs import keys
 from envs.scene import SceneSource
 

@@ -32,7 +32,8 @@ from dpa.ranking.transform import RankRollouts
 from dpa.rollout import RolloutTask, RolloutWorker
 from dpa.rollout.job import RolloutJob
 from dpa.tokens import TokenAction, VerletTokenizer
-from dpa.training.batches import collate_items, log_item
+from dpa.training.batches import collate_items
+from dpa.training.logs import log_item
 from envs import keys
 from envs.allocator import keep_freed_memory
 from envs.progress import progress

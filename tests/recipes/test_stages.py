@@ -22,19 +22,17 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 
 from dpa.losses import ContrastivePreferenceLoss, token_network
-from dpa.policy import ContextOptions, MotionLM, make_context
+from dpa.policy import MotionLM, make_context
 from dpa.preferences import PreferenceStore, PreferenceWriter, nearest_farthest
 from dpa.realism.config import FOLDER
 from dpa.realism.score import score
 from dpa.realism.submission import validate
 from dpa.tokens import VerletTokenizer
-from dpa.training.batches import LogReader
 from dpa.training.checkpoint import load_policy
 from dpa.training.distributed import Ranks
 from dpa.training.loggers import read_curve
 from dpa.training.optim import accumulate_gradients, clip_and_step
 from envs import keys
-from envs.augment import Augmentation
 from envs.scene import CURRENT_STEP
 from envs.sources.synthetic import straight_road
 from envs.store import SceneStore
@@ -54,7 +52,7 @@ from recipes.common.scenes import open_splits
 from recipes.evaluate import SCENE_FIGURES, final_spread, standing_moved
 from recipes.experiment.jobs import align_job
 from recipes.experiment.pool import Job, Workers
-from recipes.pretrain import log_items
+from recipes.pretrain import tuning_items
 
 METHODS = ("dpa_omf", "dpa_adef", "sft_best_oa", "sft_best_ade", "adversarial_afd")
 
@@ -92,9 +90,10 @@ def test_pretraining_writes_a_policy_and_its_curves(runs: Path) -> None:
 def test_tuning_scenes_without_a_token_to_predict_are_refused() -> None:
     scene = straight_road(2)
     scene.agents.predict[:] = False
-    read = LogReader(VerletTokenizer(), ContextOptions(control="predict"), Augmentation(), noise=0.0, max_agents=8)
+    with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):
+        cfg = compose("pretrain", ["model=nano", "model.context.control=predict"])
     with pytest.raises(ValueError, match="none of the 1 tuning scenes has a token to predict: .*control=predict"):
-        log_items([scene], read)
+        tuning_items(cfg, [scene], MotionLM("nano", VerletTokenizer()))
 
 
 def test_the_weights_that_are_best_on_the_tuning_scenes_are_kept(runs: Path) -> None:

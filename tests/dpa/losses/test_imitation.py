@@ -13,7 +13,8 @@ from dpa.losses import ImitationLoss, NextTokenLoss, token_network
 from dpa.losses.network import reference_logits
 from dpa.policy import SIZES, MotionLM, make_context
 from dpa.tokens import VerletTokenizer
-from dpa.training.batches import collate_items, log_item
+from dpa.training.batches import collate_items
+from dpa.training.logs import log_item
 from envs.sources.synthetic import straight_road
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dpa.policy.attention import METRES, KeyValues, NodeAttention, NodeMasks, RelativeAttention
+from dpa.policy.attention import GAZE, METRES, KeyValues, NodeAttention, NodeMasks, RelativeAttention, added
 from envs.geometry.frames import rotate, to_local, to_world
 
 WIDTH, HEADS = 32, 2
@@ -114,7 +114,7 @@ def test_at_the_start_of_training_the_gaze_rests_on_the_agent_itself() -> None:
     torch.nn.init.zeros_(attention.query.bias)
     keys = attention.remember(torch.zeros(1, 2, WIDTH), torch.tensor([[[2.0, 0, 0], [20.0, 0, 0]]])).keys
     gaze = attention._gaze(torch.zeros(1, 1, WIDTH), torch.zeros(1, 1, 1, 3))
-    narrow, wide = (gaze @ keys[..., -3:].transpose(-1, -2))[0, :, 0].softmax(-1)
+    narrow, wide = (gaze @ keys[..., -GAZE:].transpose(-1, -2))[0, :, 0].softmax(-1)
     assert narrow[0] > wide[0] > 0.5
 
 
@@ -124,7 +124,7 @@ def test_a_width_that_heads_do_not_divide_is_refused() -> None:
 
 
 # --- between nodes --------------------------------------------------------------------------------------------------
-AGENTS, DECISIONS = 3, 4
+AGENTS, DECISIONS = 3, 6  # more decisions than attend at a time
 
 
 def node_attention() -> NodeAttention:
@@ -137,7 +137,7 @@ def node_attention() -> NodeAttention:
 def staircase() -> NodeMasks:
     """What nodes see in one pass: the own past, and everybody up to the own decision."""
     own = torch.ones(DECISIONS, DECISIONS, dtype=torch.bool).tril()
-    return NodeMasks(own, own.repeat_interleave(AGENTS, 0).repeat_interleave(AGENTS, 1))
+    return NodeMasks(own, added(own.repeat_interleave(AGENTS, 0).repeat_interleave(AGENTS, 1)))
 
 
 @torch.no_grad()
@@ -146,8 +146,8 @@ def test_some_heads_see_the_own_past_only_and_the_others_everybody() -> None:
     assert attention.own == 1 and attention.heads == 4
     masks, memory = staircase(), attention.remember(x, pose)
     agent = torch.arange(AGENTS).repeat(DECISIONS)
-    own_past = masks.everybody & (agent[:, None] == agent)
-    each_head = torch.stack((own_past, *[masks.everybody] * 3))
+    everybody = masks.everybody == 0
+    each_head = torch.stack((everybody & (agent[:, None] == agent), *[everybody] * 3))
     plain = RelativeAttention.forward(attention, x, pose, memory, each_head)
     torch.testing.assert_close(attention(x, pose, memory, masks, AGENTS), plain, atol=1e-5, rtol=1e-4)
 

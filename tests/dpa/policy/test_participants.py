@@ -13,7 +13,7 @@ from dpa.policy import ContextOptions, MotionActor, MotionLM, collate_contexts, 
 from dpa.policy.actor import Contexts, pad_context
 from dpa.ranking.transform import RankRollouts
 from dpa.tokens import TokenAction
-from dpa.training.batches import log_item
+from dpa.training.logs import log_item
 from envs import keys
 from envs.scene import CURRENT_STEP, Scene
 from envs.traffic import TrafficEnv

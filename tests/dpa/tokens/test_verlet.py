@@ -230,9 +230,9 @@ def noisy_tracks(noise: float, seed: int = 0) -> tuple[TokenizedTracks, Tokenize
     """The same tracks with noise and without."""
     agents = straight_road(6, seed=1).agents
     given = (agents.poses[:, 11:], agents.valid[:, 11:], agents.recent(5), agents.kind)
-    generator = torch.Generator().manual_seed(seed)
+    drawn = torch.rand(6, 16, 3, generator=torch.Generator().manual_seed(seed))
     tokenizer = VerletTokenizer()
-    return tokenizer.encode_tracks(*given, noise=noise, generator=generator), tokenizer.encode_tracks(*given)
+    return tokenizer.encode_tracks(*given, noise=noise, drawn=drawn), tokenizer.encode_tracks(*given)
 
 
 def test_without_noise_the_labels_are_the_tokens() -> None:
@@ -259,7 +259,7 @@ def test_noise_replaces_tokens_by_neighbours_and_labels_lead_back_to_the_log() -
     assert noisy.labels[agent, step] == plain.tokens[agent, step]
 
 
-def test_noise_is_that_of_the_generator() -> None:
+def test_noise_is_that_of_the_draws() -> None:
     (one, _), (same, _), (other, _) = (noisy_tracks(0.5, seed) for seed in (1, 1, 2))
     assert torch.equal(one.tokens, same.tokens) and not torch.equal(one.tokens, other.tokens)
 
@@ -267,7 +267,9 @@ def test_noise_is_that_of_the_generator() -> None:
 def test_neighbours_of_the_outermost_tokens_are_tokens() -> None:
     corners = torch.tensor([0, 12, 156, 168]).repeat(100)
     kind = torch.ones_like(corners)
-    neighbours = VerletTokenizer().neighbour(corners, kind, torch.Generator().manual_seed(0))
+    neighbours = VerletTokenizer().neighbour(
+        corners, kind, torch.rand(400, 2, generator=torch.Generator().manual_seed(0))
+    )
     assert neighbours.min() >= 0 and neighbours.max() < CHANGES**2
     assert set(neighbours.view(100, 4)[:, 0].tolist()) == {0, 1, 13, 14}
 

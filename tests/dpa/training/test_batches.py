@@ -7,12 +7,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dpa.policy import ContextOptions, make_context
+from dpa.policy import make_context
 from dpa.tokens import VerletTokenizer
-from dpa.training.batches import Item, LogReader, ShuffledOrder, collate_items, crop_agents, log_item, micro_batches
-from envs.augment import Augmentation
-from envs.seeding import make_generator
-from envs.sources.synthetic import build_scene, straight_road
+from dpa.training.batches import Item, ShuffledOrder, collate_items, micro_batches
+from dpa.training.logs import log_item
+from envs.sources.synthetic import straight_road
 
 
 def item(num_agents: int, seed: int = 0) -> Item:
@@ -50,53 +49,6 @@ def test_nothing_to_draw_from_is_refused(sizes: tuple[int, int]) -> None:
 
 
 # --- items ----------------------------------------------------------------------------------------------------------
-def test_the_log_is_one_rollout_of_its_scene() -> None:
-    context, tokenizer = make_context(straight_road(2, seed=3)), VerletTokenizer()
-    result = log_item(context, tokenizer)
-    assert result.tokens.shape == (1, 2, 16) and result.token_valid.all()
-    poses = tokenizer.decode_tracks(result.tokens[0], context.recent, context.kind)
-    assert (poses - context.logged)[:, 4::5, :2].norm(dim=-1).max() < 0.2
-
-
-def test_agents_that_are_not_controlled_or_leave_the_log_have_no_valid_tokens() -> None:
-    valid = torch.ones(3, 91, dtype=torch.bool)
-    valid[1, 31:] = False
-    scene = straight_road(3)
-    scene.agents = build_scene(scene.agents.poses, [(0, torch.zeros(2, 2))], valid=valid).agents
-    result = log_item(make_context(scene, ContextOptions(max_controlled=2)), VerletTokenizer())
-    assert result.token_valid.sum(-1).tolist() == [16, 4, 0]
-
-
-def test_a_crowd_is_cropped_to_the_agents_around_one_of_them() -> None:
-    cropped = crop_agents(make_context(straight_road(9)), 4, make_generator(0, "crop", 5))
-    assert cropped.kind.shape == (4,)
-    x = cropped.recent[:, -1, 0]
-    assert ((x[:-1] - x[1:]) == 15).all(), "in file, 15 m apart: four neighbours, in the order of the scene"
-
-
-def test_cropping_depends_on_the_generator_alone() -> None:
-    crowd = make_context(straight_road(9))
-    draws = [crop_agents(crowd, 4, make_generator(0, "crop", step)).recent for step in (1, 1, 2, 3, 4)]
-    assert torch.equal(draws[0], draws[1])
-    assert any(not torch.equal(draws[0], other) for other in draws[2:])
-
-
-def test_few_agents_are_left_alone() -> None:
-    few = make_context(straight_road(3))
-    assert crop_agents(few, 3, make_generator(0)) is few
-
-
-def test_a_log_is_read_as_the_generator_says() -> None:
-    read = LogReader(VerletTokenizer(), ContextOptions(), Augmentation(mirror=0.5), noise=0.5, max_agents=4)
-    crowd = straight_road(9, seed=1)
-    items = [read(crowd, make_generator(0, draw)) for draw in (0, 0, 1, 2, 3, 4)]
-    assert all(one.tokens.shape == (1, 4, 16) for one in items)
-    assert torch.equal(items[0].tokens, items[1].tokens) and torch.equal(items[0].labels, items[1].labels)
-    assert not torch.equal(items[0].tokens, items[0].labels), "noise changes tokens and labels lead back"
-    sides = {float(one.context.recent[0, -1, 1].sign()) for one in items}
-    assert sides == {-1.0, 1.0}, "some are mirrored"
-
-
 def test_labels_are_the_tokens_where_nothing_else_is_said() -> None:
     one = item(2)
     labelled = one._replace(tokens=one.tokens + 1)

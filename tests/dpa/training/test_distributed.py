@@ -18,8 +18,9 @@ from torchrl.objectives import LossModule
 from dpa.losses import ContrastivePreferenceLoss, NextTokenLoss, token_network
 from dpa.policy import MotionLM, make_context
 from dpa.tokens import VerletTokenizer
-from dpa.training.batches import Item, collate_items, log_item
+from dpa.training.batches import Item, collate_items
 from dpa.training.distributed import ALONE, VARIABLES, Ranks, join_ranks, started_ranks
+from dpa.training.logs import log_item
 from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer
 from envs import keys
 from envs.seeding import make_generator
