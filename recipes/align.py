@@ -30,7 +30,7 @@ from recipes.alignment.snapshots import Snapshots
 from recipes.alignment.step import AlignmentStep
 from recipes.alignment.watch import Watch
 from recipes.common.cli import CONFIG, check_steps, finished, finite, ranked_recipe
-from recipes.common.models import check_written, write_policy
+from recipes.common.models import check_written, policy_file, write_policy
 from recipes.common.scenes import open_splits
 
 SATURATED = "saturated"
@@ -147,7 +147,7 @@ def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.align``."""
     check_steps(cfg.alignment, "alignment")
     splits = open_splits(cfg.scenes)
-    policy, preferences = Path(cfg.policy), Path(cfg.preferences)
+    policy, preferences = policy_file(cfg.policy), Path(cfg.preferences)
     expert = None if cfg.expert is None else Path(cfg.expert)
     watch = None if cfg.watch is None else Watch(splits.tune, Path(cfg.watch), policy)
     with join_ranks(cfg.device) as ranks:

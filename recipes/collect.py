@@ -27,7 +27,7 @@ from envs.files import write_json
 from envs.progress import progress
 from envs.store import SceneStore
 from recipes.common.cli import CONFIG, build, plain, recipe
-from recipes.common.models import open_policy, weights_digest
+from recipes.common.models import open_policy, policy_file, weights_digest
 from recipes.common.rankings import build_distance
 from recipes.common.scenes import fingerprint, open_splits
 
@@ -120,7 +120,7 @@ def main(cfg: DictConfig) -> None:
     if not 0 <= cfg.part < cfg.parts:
         raise ValueError(f"part must be from 0 to parts - 1, got part={cfg.part} of parts={cfg.parts}.")
     indices = range(cfg.part, len(scenes), cfg.parts)
-    store = collect(cfg, scenes, Path(cfg.policy), cfg.seed, Path(cfg.output), indices)
+    store = collect(cfg, scenes, policy_file(cfg.policy), cfg.seed, Path(cfg.output), indices)
     if cfg.json is not None:
         write_json(cfg.json, data_card(store).to_json())
     print(f"preferences of {len(store)} scenes: {cfg.output}")

@@ -2,6 +2,7 @@
 
     python -m recipes.pretrain                                   # SUMO scenes, made on the spot
     python -m recipes.pretrain scenes=gpudrive scenes.train=DIR scenes.eval=DIR output=runs/reference
+    python -m recipes.pretrain pretraining.start=zoo:motionlm-nano-sumo pretraining.lr=3e-4 scenes=...  # goes on
     torchrun --nproc-per-node 8 -m recipes.pretrain device=cuda pretraining.batch_size=64  # docs/scale.md
 
 The weights that are best on the tuning scenes become ``policy.pt``. Run the same command again to go on after a kill.
@@ -11,16 +12,20 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import hydra
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict
+from torch import Tensor
 
 from dpa.losses import NextTokenLoss, token_network
 from dpa.policy import MotionLM
 from dpa.training.batches import Item, collate_items, micro_batches
+from dpa.training.checkpoint import load_policy, load_weights
 from dpa.training.distributed import ALONE, Ranks, join_ranks
 from dpa.training.logs import LogItems
 from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
@@ -34,22 +39,40 @@ from envs.progress import progress
 from envs.scene import SceneSource
 from envs.seeding import make_generator
 from recipes.common.cli import CONFIG, build, check_steps, deciding, finished, ranked_recipe
-from recipes.common.models import build_policy, check_written, context_options, policy_config, write_policy
+from recipes.common.models import (
+    build_policy,
+    check_written,
+    context_options,
+    digest_of,
+    policy_config,
+    policy_file,
+    write_policy,
+)
+from recipes.common.provenance import provenance
 from recipes.common.scenes import Splits, fingerprint, open_splits
 
-OBSERVING = ("checkpoint_interval", "max_rows", "workers", "keep_gib")
-"""Options of the section ``pretraining`` that change nothing about the policy."""
+OBSERVING = ("checkpoint_interval", "max_rows", "workers", "keep_gib", "start")
+"""Options of the section ``pretraining`` that change nothing about the policy; of its start, the weights count."""
 
 
-def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path, ranks: Ranks = ALONE) -> Path:
+def pretrain(
+    cfg: DictConfig,
+    splits: Splits,
+    seed: int,
+    folder: Path,
+    ranks: Ranks = ALONE,
+    *,
+    made_by: dict[str, Any] | None = None,
+) -> Path:
     """Train one reference policy.
 
     Args:
-        cfg: with the sections ``model``, ``pretraining``, ``logger``, ``device``.
+        cfg: with the sections ``scenes``, ``model``, ``pretraining``, ``logger``, ``device``.
         splits: scenes.
         seed: of everything that draws.
         folder: of the run.
         ranks: that train together; the batch of the options is theirs together.
+        made_by: :func:`~recipes.common.provenance.provenance`, for the file of the policy.
 
     Returns:
         The file of the policy.
@@ -66,12 +89,17 @@ def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path, ranks: Ra
         "scenes": fingerprint(splits.train),
         "tuning_scenes": fingerprint(splits.tune),
     }
+    origin = None if options.start is None else Origin.open(options.start)
+    if origin is not None:
+        decided_by["start"] = origin.digest
     if ranks.agree(finished(result, decided_by) is not None and path.is_file(), "finished =", folder):
         check_written(path)
         return path
     seed_everything(seed)
     device = ranks.place(cfg.device)
     model = build_policy(config).to(device)
+    if origin is not None:
+        origin.load_into(model, config)
     best = copy.deepcopy(model)
     train = training_items(cfg, splits.train, model, seed, ranks)
     tune = tuning_items(cfg, splits.tune, model, ranks)
@@ -96,6 +124,8 @@ def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path, ranks: Ra
         train.load_state_dict(run.state["train"])
     batches = train.endless()
     with run:
+        if origin is not None and run.first_step == 0:
+            look(run, model, best, tune, device, ranks)
         for step in run.steps():
             items = next(batches)
             run.state["train"] = train.state_dict()
@@ -104,16 +134,72 @@ def pretrain(cfg: DictConfig, splits: Splits, seed: int, folder: Path, ranks: Ra
             norm = clip_and_step(optimizer, options.max_norm, schedule)
             run.log({f"train/{key}": value for key, value in losses.items()} | {"train/gradient_norm": norm})
             if (step + 1) % options.tune_interval == 0 or step + 1 == options.steps:
-                measured = negative_log_likelihood(model, tune, device, ranks)
-                run.log({f"tune/{key}": value for key, value in measured.items()})
-                if measured["nll"] < run.state["best_nll"]:
-                    run.state["best_nll"] = measured["nll"]
-                    best.load_state_dict(model.state_dict())
+                look(run, model, best, tune, device, ranks)
     if ranks.main:
-        write_policy(path, best, config, {"method": "reference", "seed": seed, "tune_nll": run.state["best_nll"]})
+        made = {
+            "method": "reference",
+            "seed": seed,
+            "tune_nll": run.state["best_nll"],
+            "source": cfg.scenes.source,
+            "start": None if origin is None else origin.described,
+            "made_by": made_by,
+        }
+        write_policy(path, best, config, made)
         write_json(result, {"options": decided_by, "policy": str(path), "tune_nll": run.state["best_nll"]})
     ranks.wait()
     return path
+
+
+def look(run: Run, model: MotionLM, best: MotionLM, tune: list[Item], device: str, ranks: Ranks = ALONE) -> None:
+    """Measure the model on the tuning scenes; ``best`` becomes its copy where it is better than all before."""
+    measured = negative_log_likelihood(model, tune, device, ranks)
+    run.log({f"tune/{key}": value for key, value in measured.items()})
+    if measured["nll"] < run.state["best_nll"]:
+        run.state["best_nll"] = measured["nll"]
+        best.load_state_dict(model.state_dict())
+
+
+@dataclass(frozen=True)
+class Origin:
+    """The policy that a training starts from.
+
+    Attributes:
+        file: of the policy.
+        weights: of it.
+        config: of it.
+        made: how it came about, as its file says.
+        digest: of its weights.
+    """
+
+    file: Path
+    weights: dict[str, Tensor]
+    config: dict[str, Any]
+    made: dict[str, Any]
+    digest: str
+
+    @classmethod
+    def open(cls, name: str) -> Origin:
+        """Read a policy.
+
+        Args:
+            name: its file, or its name in the zoo.
+        """
+        file = policy_file(name)
+        weights, config, made = load_policy(file)
+        return cls(file, weights, config, made, digest_of(weights))
+
+    def load_into(self, model: MotionLM, config: dict[str, Any]) -> None:
+        """Give a model these weights.
+
+        Raises:
+            ValueError: the model has other tokens, another size, or sees scenes in another way.
+        """
+        load_weights(model, self.weights, self.config, config, where=f"pretraining.start={self.file}")
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """For the file of what becomes of it."""
+        return {"weights": self.digest, **self.made}
 
 
 def parts_of(items: list[Item], max_rows: int, device: str, ranks: Ranks = ALONE) -> Iterator[tuple[TensorDict, float]]:
@@ -198,7 +284,8 @@ def main(cfg: DictConfig) -> None:
     check_steps(cfg.pretraining, "pretraining")
     splits = open_splits(cfg.scenes)
     with join_ranks(cfg.device) as ranks:
-        path = pretrain(cfg, splits, cfg.seed, Path(cfg.output), ranks)
+        made_by = provenance("pretrain", cfg.device)
+        path = pretrain(cfg, splits, cfg.seed, Path(cfg.output), ranks, made_by=made_by)
         if ranks.main:
             print(f"policy: {path}")
 

@@ -19,7 +19,7 @@ from envs import keys
 from envs.progress import progress
 from envs.store import SceneStore
 from recipes.common.cli import CONFIG, recipe
-from recipes.common.models import open_policy
+from recipes.common.models import open_policy, policy_file
 from recipes.common.rankings import build_distance, open_preferences
 from recipes.common.rolled import stored
 from recipes.common.scenes import open_splits
@@ -68,7 +68,7 @@ def _fields(ranked: Ranking) -> dict[str, Tensor]:
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.rerank``."""
     scenes = open_splits(cfg.scenes)[cfg.split]
-    store = rerank(cfg.ranking, scenes, Path(cfg.policy), Path(cfg.preferences), Path(cfg.output))
+    store = rerank(cfg.ranking, scenes, policy_file(cfg.policy), Path(cfg.preferences), Path(cfg.output))
     print(f"preferences of {len(store)} scenes: {cfg.output}")
 
 

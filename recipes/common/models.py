@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
+from dpa import zoo
 from dpa.policy import SIZES, ContextOptions, MotionLM, MotionLMConfig
 from dpa.tokens import MotionTokenizer, VerletTokenizer
 from dpa.training.checkpoint import CheckpointError, load_policy, load_weights, save_policy
@@ -71,14 +72,33 @@ def check_written(path: Path) -> None:
         raise ValueError(f"{error} To train it again, remove {path.parent}.") from None
 
 
+def policy_file(name: str | Path) -> Path:
+    """The file of a policy: of one in the zoo where the name begins with ``zoo:``, otherwise the path itself.
+
+    Raises:
+        ValueError: the zoo has no such policy, or its file there is damaged.
+
+    Examples:
+        >>> policy_file("runs/pretrain/policy.pt").name
+        'policy.pt'
+    """
+    text = str(name)
+    return zoo.find(text.removeprefix(zoo.PREFIX)) if text.startswith(zoo.PREFIX) else Path(name)
+
+
 def open_policy(path: str | Path, device: str = "cpu") -> tuple[MotionLM, ContextOptions, dict[str, Any]]:
     """A saved policy, its context options and its configuration.
 
+    Args:
+        path: file, or ``zoo:NAME``.
+        device: of the policy.
+
     Raises:
         FileNotFoundError: no such file.
+        ValueError: the zoo has no such policy.
         CheckpointError: the file is damaged or no policy.
     """
-    weights, config, _ = load_policy(path)
+    weights, config, _ = load_policy(policy_file(path))
     model = build_policy(config)
     load_weights(model, weights, config, config, where=str(path))
     return model.to(device).eval(), ContextOptions(**config["context"]), config
@@ -88,8 +108,8 @@ def policies_of(cfg: DictConfig) -> dict[str, Path]:
     """Files of the policies that ``cfg.policies`` lists.
 
     Args:
-        cfg: with ``policies``, a path or a list of them. A path may have the wildcards of a shell, as in
-            ``runs/study/seed_*/reference/policy.pt``: the references of all seeds of a study.
+        cfg: with ``policies``, a path or a list of them, or names in the zoo. A path may have the wildcards of a
+            shell, as in ``runs/study/seed_*/reference/policy.pt``: the references of all seeds of a study.
 
     Returns:
         By the name of their run's folder, or by their whole path where that is not enough; those of a wildcard in
@@ -116,6 +136,8 @@ def policies_of(cfg: DictConfig) -> dict[str, Path]:
 
 def _like(path: str) -> list[str]:
     """The file itself, or those that are like it where its name has wildcards."""
+    if path.startswith(zoo.PREFIX):
+        return [str(policy_file(path))]
     if not glob.has_magic(path) or Path(path).exists():
         return [path]
     found = sorted(glob.glob(path))
@@ -126,8 +148,13 @@ def _like(path: str) -> list[str]:
 
 def weights_digest(model: torch.nn.Module) -> str:
     """Digest of a policy's parameters."""
+    return digest_of(model.state_dict())
+
+
+def digest_of(weights: Mapping[str, torch.Tensor]) -> str:
+    """Digest of parameters."""
     digest = hashlib.sha256()
-    for name, value in sorted(model.state_dict().items()):
+    for name, value in sorted(weights.items()):
         digest.update(name.encode())
         digest.update(value.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()[:16]

@@ -1,0 +1,91 @@
+"""Pre-training that goes on from another policy, on scenes of another source."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from dpa.training.checkpoint import load_policy
+from dpa.training.loggers import read_curve
+from recipes.common.models import digest_of, open_policy
+
+
+@pytest.fixture(scope="module")
+def origin(tmp_path_factory: pytest.TempPathFactory, run: Callable, options: Callable) -> Path:
+    """A trained policy."""
+    folder = tmp_path_factory.mktemp("origin")
+    assert run("pretrain", *options("pretrain", f"output={folder}", "pretraining.lr=1e-2")).status == 0
+    return folder / "policy.pt"
+
+
+def elsewhere(options: Callable, stores: Path, start: object, output: Path, *more: str) -> list[str]:
+    """Options of a training on other scenes."""
+    command = options("pretrain", f"pretraining.start={start}", f"output={output}", "seed=1", *more)
+    return [*command, f"scenes.train={stores / 'other'}"]
+
+
+def test_training_goes_on_from_the_weights_of_the_start(
+    run: Callable, options: Callable, stores: Path, origin: Path, tmp_path: Path
+) -> None:
+    command = elsewhere(options, stores, origin, tmp_path, "pretraining.lr=1e-9", "pretraining.steps=2")
+    outcome = run("pretrain", *command)
+    assert outcome.status == 0, outcome.err
+    (before, _, made), (after, _, now) = load_policy(origin), load_policy(tmp_path / "policy.pt")
+    assert all(torch.allclose(after[name], value, atol=1e-6) for name, value in before.items())
+    assert now["start"]["weights"] == digest_of(before) and now["start"]["tune_nll"] == made["tune_nll"]
+    assert now["start"]["source"] == now["source"] == "store" and now["start"]["start"] is None
+
+
+def test_the_start_is_measured_and_kept_where_training_makes_it_no_better(
+    run: Callable, options: Callable, stores: Path, origin: Path, tmp_path: Path
+) -> None:
+    ruinous = ("pretraining.lr=0.1", "pretraining.steps=3")
+    outcome = run("pretrain", *elsewhere(options, stores, origin, tmp_path, *ruinous))
+    assert outcome.status == 0, outcome.err
+    (first, nll), *others = read_curve(tmp_path, "tune/nll")
+    assert first == 0 and all(value > nll for _, value in others)
+    weights, _, made = load_policy(tmp_path / "policy.pt")
+    assert made["tune_nll"] == nll and digest_of(weights) == digest_of(load_policy(origin)[0])
+
+
+def test_a_start_with_other_tokens_or_another_size_is_refused(
+    run: Callable, options: Callable, stores: Path, origin: Path, tmp_path: Path
+) -> None:
+    for option in ("model.tokenizer.frame=scene", "model.context.max_pieces=99", "model.size=small"):
+        outcome = run("pretrain", *elsewhere(options, stores, origin, tmp_path / "run", option))
+        assert outcome.status == 2 and outcome.err.count("error:") == 1
+        assert option.split(".")[-1].split("=")[0] in outcome.err or "width" in outcome.err
+        assert str(origin) in outcome.err and not (tmp_path / "run/checkpoints").exists()
+
+
+def test_a_start_that_is_no_policy_is_refused(run: Callable, options: Callable, stores: Path, tmp_path: Path) -> None:
+    torn = tmp_path / "torn.pt"
+    torn.write_bytes(b"PK\x03\x04 torn")
+    for start, told in ((torn, "torn.pt"), ("zoo:motionlm-nano-sum", "did you mean zoo:motionlm-nano-sumo?")):
+        outcome = run("pretrain", *elsewhere(options, stores, start, tmp_path / "run"))
+        assert outcome.status == 2 and told in outcome.err, outcome.err
+
+
+def test_a_run_of_another_start_is_another_run(
+    run: Callable, options: Callable, stores: Path, origin: Path, tmp_path: Path
+) -> None:
+    command = elsewhere(options, stores, origin, tmp_path, "pretraining.steps=2")
+    assert run("pretrain", *command).status == 0
+    same = run("pretrain", *command)
+    assert same.status == 0 and "step/s" not in same.err, "nothing is trained again"
+    other = run("pretrain", *(option for option in command if "pretraining.start" not in option))
+    assert other.status == 2 and "other options" in other.err
+
+
+def test_what_a_policy_started_from_changes_nothing_about_how_it_is_opened(
+    run: Callable, options: Callable, stores: Path, origin: Path, tmp_path: Path
+) -> None:
+    assert run("pretrain", *elsewhere(options, stores, origin, tmp_path, "pretraining.steps=2")).status == 0
+    assert open_policy(tmp_path / "policy.pt")[2] == open_policy(origin)[2]
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])
