@@ -49,6 +49,11 @@ LOG_PROB: NestedKey = (AGENTS, "log_prob")
 SAMPLING_LOG_PROB: NestedKey = (AGENTS, "sampling_log_prob")
 """``[B, A]``: log-probability of the token under the distribution that it was drawn from [nats]."""
 
+LABEL: NestedKey = (AGENTS, "label")
+"""``[B, A]`` int64: the token that comes nearest to the log from where the agent is (of a policy that follows it)."""
+LABEL_VALID: NestedKey = (AGENTS, "label_valid")
+"""``[B, A]`` bool: a controlled agent whose log says where it is at the end of the decision."""
+
 # --- what a step gives back -----------------------------------------------------------------------------------------
 REWARD: NestedKey = (AGENTS, "reward")
 """``[B, A, 1]``: minus the mean displacement from the log over the decision's poses [m]."""
@@ -87,6 +92,8 @@ RANK: NestedKey = "rank"
 # --- what a loss reads ----------------------------------------------------------------------------------------------
 LABELS: NestedKey = "labels"
 """``[S, M, A, T]`` int64: tokens to predict, those of ``tokens`` or, after noise, those that lead back to the log."""
+LEARNT: NestedKey = "learnt"
+"""``[S, M or 1, A, T]`` bool: labels that count, where these are others than the tokens that count."""
 PREFERRED: NestedKey = "preferred"
 """``[S, M, A, T]`` int64: tokens of the preferred rollouts."""
 UNPREFERRED: NestedKey = "unpreferred"

@@ -4,7 +4,8 @@
     torchrun --nproc-per-node 2 -m recipes.align method=dpa_omf policy=FILE preferences=DIR  # docs/scale.md
 
 Methods differ in one YAML each: dpa_omf, dpa_adef, sft_best_oa, sft_best_ade, adversarial_afd, and others under
-``config/method``. Run the same command again to go on after a kill.
+``config/method``. CAT-K (``method=cat_k``) learns from logs and takes no preferences. Run the same command again to go
+on after a kill.
 """
 
 from __future__ import annotations
@@ -14,16 +15,19 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from dpa.losses import SaturationWatch
 from dpa.report.curves import read_curves
 from dpa.training.distributed import ALONE, Ranks, join_ranks
 from dpa.training.run import Run
 from dpa.training.seeding import seed_everything
+from envs import keys
 from envs.files import write_json
 from envs.progress import full_name, message
 from envs.store import SceneStore
+from recipes.alignment.closed_loop import ClosedLoopStep
+from recipes.alignment.data import ON_POLICY, check_data
 from recipes.alignment.inputs import Inputs
 from recipes.alignment.losses import check_fit, make_loss
 from recipes.alignment.snapshots import Snapshots
@@ -42,7 +46,7 @@ def align(
     method: DictConfig,
     scenes: SceneStore,
     policy: Path,
-    preferences: Path,
+    preferences: Path | None,
     seed: int,
     folder: Path,
     ranks: Ranks = ALONE,
@@ -62,7 +66,8 @@ def align(
         method: ``data`` and ``loss``, from ``config/method``.
         scenes: that the preferences are of.
         policy: file of the policy to start from, which is also the reference of the loss.
-        preferences: folder of the store that :mod:`recipes.collect` made with it.
+        preferences: folder of the store that :mod:`recipes.collect` made with it; None for a method that rolls out
+            by itself.
         seed: of batches.
         folder: of the run; snapshots are kept in ``step_<step>`` inside.
         ranks: that train together; the scenes of a step are theirs together.
@@ -81,8 +86,9 @@ def align(
     options, path, result = cfg.alignment, folder / "policy.pt", folder / "result.json"
     ranks.share_of(options.scenes_per_step, "alignment.scenes_per_step")
     device = ranks.place(cfg.device)
+    check_preferences(method, preferences, expert, section)
     inputs = Inputs.open(policy, preferences, expert, scenes, among, device)
-    check_fit(method, options, inputs.store.provenance.num_rollouts)
+    check_fit(method, options, 0 if inputs.store is None else inputs.store.provenance.num_rollouts)
     model, decided_by = inputs.model, inputs.deciding(method, options, seed)
     snapshots = Snapshots.of(folder, options)
     kept = finished(result, decided_by)
@@ -92,9 +98,8 @@ def align(
         tell(method, kept.get(SATURATED), ranks)
         return path
     seed_everything(seed)
-    candidates = inputs.candidates(method.data, seed)
+    take = make_step(method, inputs, options, seed, device, ranks)
     looks = inputs.looks(method.data, options, watch) if ranks.main else []
-    take = AlignmentStep(model, ranks.wrap(make_loss(method.loss, model)), candidates, options, seed, device, ranks)
     run = Run(
         folder,
         {"policy": model, "optimizer": take.optimizer, "schedule": take.schedule},
@@ -128,6 +133,39 @@ def align(
     return path
 
 
+def make_step(
+    method: DictConfig, inputs: Inputs, options: DictConfig, seed: int, device: str, ranks: Ranks
+) -> AlignmentStep | ClosedLoopStep:
+    """What a step of the method does."""
+    loss, model = make_loss(method.loss, inputs.model), inputs.model
+    if method.data.kind in ON_POLICY:
+        check_data(method.data, 0)
+        loss.set_keys(labels=keys.LABELS, learnt=keys.LEARNT)
+        scenes, candidates = inputs.scenes.subset(inputs.learnt), method.data.candidates
+        return ClosedLoopStep(model, ranks.wrap(loss), scenes, inputs.context, candidates, options, seed, device, ranks)
+    candidates = inputs.candidates(method.data, seed)
+    return AlignmentStep(model, ranks.wrap(loss), candidates, options, seed, device, ranks)
+
+
+def check_preferences(method: DictConfig, preferences: Path | None, expert: Path | None, section: str) -> None:
+    """Refuse a method without the rollouts that it learns from, or with some that it does not read.
+
+    Raises:
+        ValueError: so it is.
+    """
+    rolls = method.data.kind in ON_POLICY
+    if rolls and (preferences is not None or expert is not None):
+        raise ValueError(
+            f"{section}={method.name} learns from logs and reads no rollouts, got preferences={preferences} and "
+            f"expert={expert}; leave them out."
+        )
+    if not rolls and preferences is None:
+        raise ValueError(
+            f"{section}={method.name} learns from ranked rollouts, and none are given; make them with recipes.collect "
+            "and say preferences=DIR."
+        )
+
+
 def write_result(result: Path, policy: Path, decided_by: dict[str, Any], saturation: SaturationWatch) -> None:
     """Say that a run is finished: what decided it, its last figures, and the warning where its loss saturated."""
     last = {name: finite(curve["value"][-1]) for name, curve in read_curves(result.parent).items()}
@@ -147,7 +185,8 @@ def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.align``."""
     check_steps(cfg.alignment, "alignment")
     splits = open_splits(cfg.scenes)
-    policy, preferences = policy_file(cfg.policy), Path(cfg.preferences)
+    on_policy = cfg.method.data.kind in ON_POLICY and OmegaConf.is_missing(cfg, "preferences")
+    policy, preferences = policy_file(cfg.policy), None if on_policy else Path(cfg.preferences)
     expert = None if cfg.expert is None else Path(cfg.expert)
     watch = None if cfg.watch is None else Watch(splits.tune, Path(cfg.watch), policy)
     with join_ranks(cfg.device) as ranks:

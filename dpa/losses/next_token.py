@@ -57,13 +57,15 @@ class NextTokenLoss(LossModule):
             context: :class:`~dpa.policy.SceneContext` of batch size ``[S]``.
             tokens: ``[S, M, A, T]`` int64, what the network reads.
             labels: ``[S, M, A, T]`` int64, what it is to predict; the tokens themselves by default.
-            token_valid: ``[S, M or 1, A, T]`` bool.
+            token_valid: ``[S, M or 1, A, T]`` bool; an agent is seen by others while its tokens are valid.
+            learnt: ``[S, M or 1, A, T]`` bool, labels that count; by default those of valid tokens.
         """
 
         context: NestedKey = CONTEXT
         tokens: NestedKey = keys.TOKENS
         labels: NestedKey = keys.TOKENS
         token_valid: NestedKey = keys.TOKEN_VALID
+        learnt: NestedKey = keys.TOKEN_VALID
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
@@ -87,7 +89,8 @@ class NextTokenLoss(LossModule):
     def in_keys(self) -> list[NestedKey]:
         """Where the input lies, in the order in which plain tensors are taken."""
         accepted = self.tensor_keys
-        return list(dict.fromkeys((accepted.context, accepted.tokens, accepted.labels, accepted.token_valid)))
+        read = (accepted.context, accepted.tokens, accepted.labels, accepted.token_valid, accepted.learnt)
+        return list(dict.fromkeys(read))
 
     def _forward_value_estimator_keys(self, **_: object) -> None:
         """There is no value estimator."""
@@ -106,11 +109,12 @@ class NextTokenLoss(LossModule):
         each = cross_entropy(
             logits.flatten(0, -2), labels.flatten(), reduction="none", label_smoothing=self.label_smoothing
         )
-        loss = masked_mean(each.view_as(labels), valid)
+        learnt = tensordict[accepted.learnt]
+        loss = masked_mean(each.view_as(labels), learnt)
         with torch.no_grad():
             hit = (logits.argmax(-1) == labels).to(logits.dtype)
-            entropy = masked_mean(token_entropy(logits), valid)
-            diagnostics = {"accuracy": masked_mean(hit, valid), "entropy": entropy}
+            entropy = masked_mean(token_entropy(logits), learnt)
+            diagnostics = {"accuracy": masked_mean(hit, learnt), "entropy": entropy}
             diagnostics |= self._diagnostics(batch, logits)
         return TensorDict({"loss_next_token": loss, **diagnostics}, batch_size=[])
 

@@ -196,6 +196,7 @@ class MotionActor(TensorDictModuleBase):
         context = collate_contexts([self.contexts[i] for i in self._scenes.tolist()]).to(step.device)
         context = pad_context(context, shape[1])
         self._check_agents(context, tensordict, step == 0)
+        self._context = context
         with self._autocast(step.device):
             self._memory = self.model.encode(context)
         self._draw_noise(begins.nonzero()[:, 0].tolist(), scene.tolist())

@@ -13,9 +13,12 @@ SIDES = {
     "ranking": "ranking",
     "adversarial": "pairs",
     "expert": "pairs",
+    "closed_loop": "targets",
 }
 """Ways to learn from the rollouts of a scene (``config/method``), and what each gives: M pairs, M targets to imitate,
 two sets of any sizes, or one ranking, whose nearer half is the preferred side and the rest the unpreferred one."""
+ON_POLICY = ("closed_loop",)
+"""Those of them that roll the policy out themselves, in every step, and need no rollouts from before."""
 RANKED = ("pairs", "best", "sets", "ranking")
 """Those of them that read ranks."""
 READ = {
@@ -25,6 +28,7 @@ READ = {
     "ranking": ("rank_by", "num"),
     "adversarial": ("num",),
     "expert": ("num",),
+    "closed_loop": ("candidates",),
 }
 """Options of each beside ``kind``."""
 PAIRS = ("nearest_farthest", "random", "all")
@@ -44,6 +48,8 @@ def num_candidates(data: DictConfig, held: int) -> tuple[int, int]:
         (8, 16)
     """
     data = check_data(data, held)
+    if data.kind in ON_POLICY:
+        return 1, 0
     if data.kind == "ranking":
         whole = data.num or held
         return (whole + 1) // 2, whole // 2
@@ -94,6 +100,10 @@ def _check(data: DictConfig, held: int, given: DictConfig) -> None:
             f"method.data.{unread[0]} says nothing to method.data.kind={data.kind}, which takes "
             f"{', '.join(READ[data.kind])}; leave it out (~method.data.{unread[0]})."
         )
+    if data.kind in ON_POLICY:
+        if type(data.get("candidates")) is not int or data.candidates < 1:
+            raise ValueError(f"method.data.candidates must be 1 or more, got {data.get('candidates')!r}.")
+        return
     if data.kind in RANKED and data.rank_by not in (keys.DISTANCE, keys.ADE):
         raise ValueError(f"method.data.rank_by must be distance or ade, got {data.rank_by!r}.")
     if data.kind == "pairs" and data.pairs not in PAIRS:

@@ -28,14 +28,14 @@ OBSERVING = ("checkpoint_interval", "max_rows", "snapshots", "watch_interval", "
 
 @dataclass(frozen=True)
 class Inputs:
-    """A policy, and ranked rollouts of it.
+    """A policy, and ranked rollouts of it, for a method that learns from such.
 
     Attributes:
         model: to align, without dropout.
         context: how scenes are cut up for it.
         config: of the model, as its file has it.
         scenes: that the rollouts are of.
-        store: of the rollouts.
+        store: of the rollouts; None for a method that makes its own in every step.
         expert: store of the rollouts of an expert in the same scenes, if there is one.
         learnt: indices of the scenes to learn from.
     """
@@ -44,7 +44,7 @@ class Inputs:
     context: ContextOptions
     config: dict[str, Any]
     scenes: SceneStore
-    store: PreferenceStore
+    store: PreferenceStore | None
     expert: PreferenceStore | None
     learnt: list[int]
 
@@ -52,7 +52,7 @@ class Inputs:
     def open(
         cls,
         policy: Path,
-        preferences: Path,
+        preferences: Path | None,
         expert: Path | None,
         scenes: SceneStore,
         among: Sequence[int] | None,
@@ -62,10 +62,10 @@ class Inputs:
 
         Args:
             policy: file of the policy.
-            preferences: folder of the store that :mod:`recipes.collect` made with it.
+            preferences: folder of the store that :mod:`recipes.collect` made with it; None: there is none.
             expert: folder of the store of an expert.
             scenes: that the preferences are of.
-            among: indices of the scenes to learn from; by default all that the preferences are of, and where these
+            among: indices of the scenes to learn from; by default all, or all that the preferences are of: where these
                 are not all scenes it is told how many.
             device: of the model.
 
@@ -73,6 +73,9 @@ class Inputs:
             ValueError: preferences of other scenes or of another policy, or that lack a scene of ``among``.
         """
         model, context, config = open_policy(policy, device)
+        if preferences is None:
+            everything = list(range(len(scenes)))
+            return cls(model, context, config, scenes, None, None, everything if among is None else sorted(among))
         store = open_preferences(preferences, scenes, model, policy)
         ranked = set(store.scenes.tolist())
         learnt = sorted(ranked if among is None else among)
@@ -100,7 +103,7 @@ class Inputs:
             "scenes": fingerprint(self.scenes.subset(self.learnt)),
             "seed": seed,
             "reference": weights_digest(self.model),
-            "preferences": asdict(self.store.provenance),
+            "preferences": None if self.store is None else asdict(self.store.provenance),
             "expert": None if self.expert is None else asdict(self.expert.provenance),
         }
 
@@ -119,8 +122,9 @@ class Inputs:
         """
         looks: list[Look | ImitationLook] = []
         if watch is not None:
-            looks.append(Look(watch, self.context, self.model, alignment, self.store.provenance))
-        if SIDES[data.kind] == "targets" and self.store.provenance.num_rollouts > 1:
+            provenance = None if self.store is None else self.store.provenance
+            looks.append(Look(watch, self.context, self.model, alignment, provenance))
+        if self.store is not None and SIDES[data.kind] == "targets" and self.store.provenance.num_rollouts > 1:
             looks.append(
                 ImitationLook(self.store, self.scenes, self.context, self.model, alignment, data.rank_by, self.learnt)
             )

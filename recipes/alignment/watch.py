@@ -43,7 +43,7 @@ class Look:
         context: how scenes are cut up.
         model: in training.
         options: the section ``alignment``.
-        learnt_from: origin of the rollouts that the training learns from.
+        learnt_from: origin of the rollouts that the training learns from, if it learns from such.
 
     Raises:
         ValueError: rollouts of other scenes than the tuning ones, in other tokens, or one of each alone.
@@ -55,12 +55,12 @@ class Look:
         context: ContextOptions,
         model: MotionLM,
         options: DictConfig,
-        learnt_from: Provenance,
+        learnt_from: Provenance | None,
     ) -> None:
         store = open_ranked_scenes(watch.preferences, watch.scenes)
         for name in ("tokenizer", "horizon"):
-            mine, other = getattr(learnt_from, name), getattr(store.provenance, name)
-            if mine != other:
+            mine, other = getattr(learnt_from, name, None), getattr(store.provenance, name)
+            if learnt_from is not None and mine != other:
                 raise ValueError(
                     f"{store.folder} has {name} {other}, and the rollouts to learn from {mine}; let a policy of the "
                     "same tokens roll the watched scenes out."

@@ -20,6 +20,7 @@ from dpa.training.run import SECONDS
 from envs.files import write_json
 from envs.seeding import make_generator
 from recipes.align import align
+from recipes.alignment.data import ON_POLICY
 from recipes.alignment.likelihoods import PROBED, divergence, make_probes, probe
 from recipes.alignment.watch import Watch
 from recipes.collect import collect
@@ -70,14 +71,14 @@ def rerank_job(cfg: DictConfig, seed: int, source: str, ranking: str) -> None:
 def align_job(cfg: DictConfig, seed: int, method: str) -> dict[str, float]:
     """One aligned policy."""
     runs, splits, setup = runs_of(cfg), open_splits(cfg.scenes), setup_of(cfg, method)
-    folder = runs.training(seed, method)
+    folder, on_policy = runs.training(seed, method), cfg.methods[method].data.kind in ON_POLICY
     with told_of(f"methods.{method}"):
         align(
             OmegaConf.merge(cfg, {"alignment": setup.merged(cfg.alignment)}),
             cfg.methods[method],
             splits.train,
             runs.policy(seed, setup.start),
-            runs.preferences(seed, "train", setup.start, setup.ranking),
+            None if on_policy else runs.preferences(seed, "train", setup.start, setup.ranking),
             drawing_seed(cfg, seed, setup.start),
             folder,
             expert=None if setup.expert is None else runs.preferences(seed, "train", setup.expert),

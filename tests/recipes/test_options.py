@@ -199,7 +199,7 @@ def test_options_that_make_no_sense_are_refused(
         ("scenes.select.min_agents=99", ("'min_agents': 99", "leaves none of the 8 scenes of scenes.train")),
         ("+scenes.select.lights=true", ("scenes.select has no option 'lights'", "has_lights")),
         ("pretraining.augmentation.mirror=2", ("pretraining.augmentation.mirror must be from 0 to 1, got 2",)),
-        ("+pretraining.step=9", ("pretraining has no option 'step'; it takes steps, batch_size",)),
+        ("+pretraining.step=9", ("pretraining has no option 'step'; it takes start, steps, batch_size",)),
         ("+colour=red", ("the recipe has no option 'colour'; it takes ", "seed")),
         ("++logger.entity=me", ("logger has no option 'entity'; it takes backend, mode",)),
         ("+pretraining.augmentation.flip=1", ("pretraining.augmentation has no option 'flip'",)),

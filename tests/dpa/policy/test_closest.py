@@ -1,0 +1,118 @@
+"""A policy that follows the log by its own likely tokens."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs import TransformedEnv
+
+from dpa.policy import MotionLM, make_context
+from dpa.policy.actor import Contexts
+from dpa.policy.closest import ClosestActor
+from dpa.tokens import TokenAction, VerletTokenizer
+from dpa.training.logs import log_item
+from envs import keys
+from envs.geometry.boxes import box_corners
+from envs.scene import Scene
+from envs.sources.synthetic import build_scene, straight_road
+from envs.traffic import TrafficEnv
+
+TOKENIZER = VerletTokenizer()
+
+
+def policy() -> MotionLM:
+    torch.manual_seed(0)
+    return MotionLM("nano", TOKENIZER).eval()
+
+
+def followed(scenes: list[Scene], candidates: int, num_rollouts: int = 1) -> TensorDictBase:
+    sizes = {"num_scenes": len(scenes), "num_rollouts": num_rollouts}
+    env = TransformedEnv(TrafficEnv(scenes, **sizes), TokenAction(TOKENIZER))
+    actor = ClosestActor(policy(), Contexts(scenes), candidates=candidates)
+    actor.num_rollouts = num_rollouts
+    return env.rollout(16, actor)
+
+
+def test_among_all_tokens_the_log_is_followed_as_by_its_own_tokens() -> None:
+    scene = straight_road(4, seed=3)
+    rolled = followed([scene], candidates=169)
+    tokens = rolled[keys.TOKEN][0].T
+    assert torch.equal(tokens, rolled[keys.LABEL][0].T), "the nearest of all is the label"
+    assert torch.equal(tokens, log_item(make_context(scene), TOKENIZER).tokens[0])
+
+
+def test_of_one_candidate_the_most_probable_is_taken_and_the_label_still_leads_back() -> None:
+    scene = straight_road(2)
+    rolled = followed([scene], candidates=1)
+    start = make_context(scene)
+    log = (start.logged[:, 4] - start.recent[:, -1])[:, :2].norm(dim=-1)
+    ends = TOKENIZER.decode(rolled[keys.LABEL][0, 0], start.recent, start.kind)[:, -1, :2].norm(dim=-1)
+    torch.testing.assert_close(ends, log, atol=0.15, rtol=0)
+    assert (rolled[keys.TOKEN] != rolled[keys.LABEL]).any()
+
+
+def test_the_taken_token_ends_nearest_to_the_log_among_the_likely_ones() -> None:
+    """By hand, for the first decision: every candidate is driven, and its box set against that of the log."""
+    scene, context = straight_road(3, seed=5), make_context(straight_road(3, seed=5))
+    rolled = followed([scene], candidates=20)
+    env = TransformedEnv(TrafficEnv([scene]), TokenAction(TOKENIZER))
+    actor = ClosestActor(policy(), Contexts([scene]), candidates=20)
+    likely = actor.logits(env.reset()).topk(20).indices[0]
+    for agent in range(3):
+        apart = []
+        for token in likely[agent]:
+            end = TOKENIZER.advance(token[None], context.recent[agent][None], context.kind[agent][None])[0, -1]
+            boxes = (torch.cat((pose, context.extent[agent, :2])) for pose in (end, context.logged[agent, 4]))
+            mine, logs = (box_corners(box) for box in boxes)
+            apart.append((mine - logs).norm(dim=-1).mean())
+        assert rolled[keys.TOKEN][0, 0, agent] == likely[agent][torch.stack(apart).argmin()]
+
+
+def test_where_the_log_ends_the_most_probable_token_is_taken_and_there_is_no_label() -> None:
+    scene = straight_road(2)
+    valid = torch.ones(2, 91, dtype=torch.bool)
+    valid[1, 31:] = False  # four decisions after the current step
+    scene.agents = build_scene(scene.agents.poses, [(0, torch.zeros(2, 2))], valid=valid).agents
+    rolled = followed([scene], candidates=169)
+    assert rolled[keys.LABEL_VALID][0].sum(0).tolist() == [16, 4]
+    log_prob = rolled[keys.LOG_PROB][0, :, 1]
+    env = TransformedEnv(TrafficEnv([scene]), TokenAction(TOKENIZER))
+    likeliest = env.rollout(16, ClosestActor(policy(), Contexts([scene]), candidates=1))
+    assert (log_prob[4:] > -torch.log(torch.tensor(169.0))).all(), "more probable than the mean"
+    assert likeliest[keys.LABEL_VALID][0].sum(0).tolist() == [16, 4]
+
+
+def test_a_hole_in_the_log_takes_a_label_and_gives_it_back() -> None:
+    scene = straight_road(1)
+    valid = torch.ones(1, 91, dtype=torch.bool)
+    valid[0, 20] = False  # the end of the second decision
+    scene.agents = build_scene(scene.agents.poses, [(0, torch.zeros(2, 2))], valid=valid).agents
+    there = followed([scene], candidates=169)[keys.LABEL_VALID][0, :, 0]
+    assert there.tolist() == [True, False] + [True] * 14
+
+
+def test_scenes_side_by_side_are_followed_as_alone() -> None:
+    scenes = [straight_road(2, seed=1), straight_road(4, seed=2)]
+    together = followed(scenes, candidates=12)
+    for row, scene in enumerate(scenes):
+        agents = len(scene.agents.sdc)
+        alone = followed([scene], candidates=12)
+        for key in (keys.TOKEN, keys.LABEL, keys.LABEL_VALID):
+            assert torch.equal(together[key][row, :, :agents], alone[key][0])
+    assert not together[keys.LABEL_VALID][0, :, 2:].any(), "padding has no labels"
+
+
+def test_several_rollouts_of_a_scene_are_one_and_the_same() -> None:
+    rolled = followed([straight_road(2)], candidates=8, num_rollouts=3)[keys.TOKEN]
+    assert torch.equal(rolled[0], rolled[1]) and torch.equal(rolled[0], rolled[2])
+
+
+@pytest.mark.parametrize("candidates", [0, 170])
+def test_a_number_of_candidates_that_cannot_be_is_refused(candidates: int) -> None:
+    with pytest.raises(ValueError, match=f"candidates must be 1 to 169, the number of tokens, got {candidates}"):
+        ClosestActor(policy(), Contexts([straight_road(1)]), candidates=candidates)
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])
