@@ -4,6 +4,7 @@ python -m recipes.benchmark realism                                # crowded sce
 python -m recipes.benchmark realism --scenarios FILE --json out.json    # scenarios of your own
 python -m recipes.benchmark rollout --sweep                        # against a naive decoder and the machine's limit
 python -m recipes.benchmark scenes womd FILES                      # size and speed of stores
+python -m recipes.benchmark training --against ../before           # beside another version of the code
 python -m recipes.benchmark transport --threads 2                  # against a loop over POT
 """
 
@@ -17,13 +18,14 @@ from pathlib import Path
 import torch
 
 from envs.files import write_json
-from recipes.benchmark import realism, rollout, scenes, transport
+from recipes.benchmark import realism, rollout, scenes, training, transport
 from recipes.common.provenance import processor
 
 PARTS = {
     "realism": (realism, "seconds of the realism metric per scene"),
     "rollout": (rollout, "agent-steps per second with the policy in the loop"),
     "scenes": (scenes, "raw files against a store: size, conversion, batches"),
+    "training": (training, "scenes per second of pre-training, against another checkout"),
     "transport": (transport, "transport problems per second, and seconds of a whole ranking"),
 }
 

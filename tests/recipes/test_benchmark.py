@@ -80,6 +80,23 @@ def test_rollouts_are_measured_and_planned_with(tmp_path: Path, capsys: pytest.C
     )
 
 
+@pytest.mark.slow
+def test_training_is_measured_beside_another_checkout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "training.json"
+    small = ["--size", "nano", "--agents", "6", "--pieces", "16", "--scenes", "12", "--epochs", "2", "--repeats", "1"]
+    here = ["--against", str(Path(__file__).parents[2]), "--folder", str(tmp_path), "--json", str(out)]
+    assert main(["training", *small, *here]) == 0
+    rows = json.loads(out.read_text())["rows"]
+    assert [(row["processes"], row["threads"]) for row in rows] == [(1, 2), (1, 2), (2, 1), (2, 1)]
+    assert all(speed > 0 for row in rows for speed in row["scenes_per_second"].values())
+    assert "pre-training, scenes/s" in capsys.readouterr().out
+
+
+def test_a_checkout_without_the_recipe_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["training", "--against", str(tmp_path)]) == 2
+    assert "holds no recipes/pretrain.py" in capsys.readouterr().err
+
+
 def test_transport_is_measured_against_a_loop_over_pot(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
