@@ -7,11 +7,10 @@ a submission of the challenge.
 
 from __future__ import annotations
 
-import zipfile
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,7 +18,8 @@ from torch import Tensor
 
 from dpa.realism.submission import SubmissionReader, decode_rollouts
 from dpa.realism.tracks import HORIZON
-from envs.scene import CURRENT_STEP, LOG_STEPS, Scene
+from envs.files import read_arrays
+from envs.scene import CURRENT_STEP, LOG_STEPS, Scene, SceneError
 from envs.sources.recording import (
     KIND_OF_FEATURE,
     LightListing,
@@ -112,7 +112,7 @@ class Scenarios:
             files = sorted(file for file in self.path.iterdir() if file.is_file())
         for file in files:
             if file.suffix == ARRAYS:
-                yield scene_from_arrays(_load(file), str(file))
+                yield scene_from_arrays(read_arrays(file), str(file))
             else:
                 yield from read_womd(file)
 
@@ -132,13 +132,13 @@ def read_rollouts(path: str | Path, scenarios: Scenarios, scene_id: str | None =
     path = Path(path)
     if path.suffix == ARRAYS:
         scene = scenarios.only() if scene_id is None else scenarios.find(scene_id)
-        yield Simulated(scene, poses_from_arrays(_load(path), scene, str(path)), str(path))
+        yield Simulated(scene, poses_from_arrays(read_arrays(path), scene, str(path)), str(path))
     elif path.is_dir() and any(path.glob(f"*{ARRAYS}")):
         for file in sorted(path.glob(f"*{ARRAYS}")):
             name = file.stem.split("__")[0]
             if scene_id in (None, name):
                 scene = scenarios.find(name)
-                yield Simulated(scene, poses_from_arrays(_load(file), scene, str(file)), str(file))
+                yield Simulated(scene, poses_from_arrays(read_arrays(file), scene, str(file)), str(file))
     else:
         for message in SubmissionReader(path):
             if scene_id in (None, message.scenario_id):
@@ -163,6 +163,9 @@ def poses_from_arrays(arrays: dict[str, np.ndarray], scene: Scene, name: str) ->
     missing = sorted({*_POSE, "object_id"} - arrays.keys())
     if missing:
         raise ValueError(f"{name} has no array {', '.join(missing)}; rollouts need {', '.join(_POSE)} and object_id.")
+    _check_numbers({key: arrays[key] for key in (*_POSE, "object_id")}, name)
+    if arrays["object_id"].ndim != 1:
+        raise ValueError(f"{name}: object_id must have the shape [A], got {list(arrays['object_id'].shape)}.")
     ids, wanted = arrays["object_id"].tolist(), scene.agents.track_id[scene.agents.present].tolist()
     if sorted(ids) != sorted(wanted):
         raise ValueError(
@@ -182,6 +185,12 @@ def poses_from_arrays(arrays: dict[str, np.ndarray], scene: Scene, name: str) ->
     return world[:, [column[track] for track in wanted]].float()
 
 
+def _check_numbers(arrays: dict[str, np.ndarray], name: str) -> None:
+    for key, array in arrays.items():
+        if array.dtype.kind not in "iuf" or array.dtype.itemsize > 8:
+            raise ValueError(f"{name}: {key} must hold numbers, got {array.dtype}.")
+
+
 def scene_from_arrays(arrays: dict[str, np.ndarray], name: str) -> Scene:
     """A scenario of arrays in world coordinates -> scene.
 
@@ -197,6 +206,10 @@ def scene_from_arrays(arrays: dict[str, np.ndarray], name: str) -> Scene:
         ValueError: an array is missing or of another shape (also SceneError, a ValueError).
     """
     notes: Notes = Counter()
+    if others := sorted(key for key, array in arrays.items() if array.dtype.kind not in "biufU"):
+        raise ValueError(
+            f"{name} is no scenario of arrays: {others[0]} holds {arrays[others[0]].dtype}; write it again."
+        )
     try:
         stacked = {
             "position": np.stack([arrays[key] for key in ("x", "y", "z")], -1).astype(np.float64),
@@ -219,11 +232,13 @@ def scene_from_arrays(arrays: dict[str, np.ndarray], name: str) -> Scene:
             raise ValueError(f"tracks must have {LOG_STEPS} steps and step {CURRENT_STEP} as the current one")
         if notes:
             raise ValueError("; ".join(notes))
+        return recording.to_scene(name).validate(name)
+    except SceneError:  # names the file itself
+        raise
     except (KeyError, IndexError, TypeError) as error:
         raise ValueError(f"{name} is no scenario of arrays: {error}; write it again.") from error
     except ValueError as error:
         raise ValueError(f"{name} is no scenario of arrays: {error}.") from None
-    return recording.to_scene(name).validate(name)
 
 
 def _polylines(arrays: dict[str, np.ndarray], feature: str, notes: Notes) -> Iterator[Polyline]:
@@ -241,12 +256,3 @@ def _lights(arrays: dict[str, np.ndarray], notes: Notes) -> Iterator[LightListin
             stop = tuple(arrays["tl_stop_point"][row].tolist())
             state = light_state(int(arrays["tl_state"][row]), notes)
             yield LightListing(step, int(arrays["tl_lane_id"][row]), state, stop)
-
-
-def _load(path: Path) -> dict[str, Any]:
-    """All arrays of a file; nothing is unpickled."""
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
-            return dict(data)
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
-        raise ValueError(f"{path} cannot be read as {ARRAYS} ({error}); write it again with numpy.savez.") from None

@@ -46,6 +46,8 @@ FORMAT = "dpa-omf/1"
 PACKAGES = ("dpa-omf", "torch", "torchrl", "tensordict", "numpy")
 SUFFIX = ".pt"
 _NAME = re.compile(r"step_(\d+)\.pt")
+_HELD = {"training": ("step",), "policy": ("policy", "metadata")}
+"""What a file of each kind holds beside what all have."""
 _RESERVED = ("format", "kind", "step", "config", "versions")
 
 
@@ -260,6 +262,12 @@ def load_policy(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[s
         CheckpointError: the file is damaged or is not a policy.
     """
     payload = _read(Path(path), "policy")
+    for name in ("policy", "config", "metadata"):
+        if not isinstance(payload[name], dict):
+            raise CheckpointError(f"{path}: {name} must be a table, got {type(payload[name]).__name__}.")
+    for name, value in payload["policy"].items():
+        if not isinstance(value, Tensor):
+            raise CheckpointError(f"{path}: {name!a} must be a tensor, got {type(value).__name__}.")
     return payload["policy"], payload["config"], {**payload["metadata"], "versions": payload["versions"]}
 
 
@@ -335,7 +343,7 @@ def _read(path: Path, kind: str) -> dict[str, Any]:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()  # torch does not compare the checksums that it writes
         if damaged is not None:
-            raise CheckpointError(f"{path} is damaged (checksum of {damaged}).")
+            raise CheckpointError(f"{path} is damaged (checksum of {damaged!a}).")
         payload = torch.load(path, map_location="cpu", weights_only=True)
     except CheckpointError:
         raise
@@ -345,8 +353,10 @@ def _read(path: Path, kind: str) -> dict[str, Any]:
         ) from error
     if not isinstance(payload, dict) or payload.get("format") != FORMAT:
         raise CheckpointError(f"{path} was not written by this version of the project ({FORMAT}).")
-    if payload["kind"] != kind:
-        raise CheckpointError(f"{path} is a {payload['kind']} file; a {kind} file is needed here.")
+    if payload.get("kind") != kind:
+        raise CheckpointError(f"{path} is a {payload.get('kind')!a} file; a {kind} file is needed here.")
+    if missing := sorted({"config", "versions", *_HELD[kind]} - payload.keys()):
+        raise CheckpointError(f"{path} lacks {', '.join(missing)}; name a file that training has written.")
     return payload
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -44,9 +45,9 @@ def card(name: str, folder: Path = FOLDER) -> dict[str, Any]:
     file = _folder_of(name, folder) / CARD
     try:
         found = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{file} is damaged ({error}); install the package again.") from None
-    if not isinstance(found, dict) or not isinstance(found.get("sha256"), str):
+    except (RecursionError, ValueError) as error:
+        raise ValueError(f"{file} is damaged ({type(error).__name__}); install the package again.") from None
+    if not isinstance(found, dict) or not re.fullmatch("[0-9a-f]{64}", str(found.get("sha256"))):
         raise ValueError(f"{file} has no sha256 of the weights; install the package again.")
     return found
 

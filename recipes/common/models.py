@@ -95,13 +95,17 @@ def open_policy(path: str | Path, device: str = "cpu") -> tuple[MotionLM, Contex
 
     Raises:
         FileNotFoundError: no such file.
+        CheckpointError: the file is damaged or no policy.
         ValueError: the zoo has no such policy.
         CheckpointError: the file is damaged or no policy.
     """
     weights, config, _ = load_policy(policy_file(path))
-    model = build_policy(config)
+    try:
+        model, context = build_policy(config), ContextOptions(**config["context"])
+    except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise CheckpointError(f"{path} has a configuration that makes no policy ({error!r}).") from None
     load_weights(model, weights, config, config, where=str(path))
-    return model.to(device).eval(), ContextOptions(**config["context"]), config
+    return model.to(device).eval(), context, config
 
 
 def policies_of(cfg: DictConfig) -> dict[str, Path]:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -18,7 +17,7 @@ from dpa.policy import ContextOptions, make_context
 from dpa.ranking.features import feature_names
 from dpa.rollout import lifted
 from dpa.tokens import MotionTokenizer
-from envs.files import PARTIAL_PREFIX, whole, write_json
+from envs.files import PARTIAL_PREFIX, read_arrays, whole, write_json
 from envs.options import differences
 from envs.scene import CURRENT_STEP, Scene
 from recipes.common.rolled import Rolled
@@ -163,9 +162,9 @@ class MotionShelf:
         """
         path = self.folder / f"{scene}.npz"
         try:
-            with np.load(path, allow_pickle=False) as arrays:
-                parts = {name: torch.from_numpy(arrays[name]) for name in Motions._fields}
-        except (BadZipFile, EOFError, KeyError, ValueError) as error:
+            arrays = read_arrays(path)
+            parts = {name: torch.from_numpy(arrays[name]) for name in Motions._fields}
+        except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} is damaged ({error}); remove it and run again.") from None
         return Motions(**{name: part if part.dtype == torch.bool else part.float() for name, part in parts.items()})
 

@@ -3,8 +3,8 @@
     python -m tests.fuzz womd --inputs 10000 --seed 0 --file data/training.tfrecord-00000-of-01000
     python -m tests.fuzz store --seed 0 --only 4711 --keep broken
 
-Each input gives sound scenes or one SceneError that names its file, within ten seconds and two gibibytes. The exit
-status is 1 if one does not.
+Each input gives sound scenes (or rollouts, or a policy) or one error that names its file, within ten seconds and two
+gibibytes. The exit status is 1 if one does not.
 """
 
 from __future__ import annotations

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
-from typing import Protocol
+from typing import Any, Protocol
 
-from envs.scene import Scene
+from envs.scene import Scene, SceneError
 from envs.sources import SOURCES
 
 Files = dict[str, bytes]
@@ -23,9 +23,9 @@ CONVERTED_EVERY = 50
 
 
 class Maker(Protocol):
-    """Makes one scene, or raises SceneError."""
+    """Makes one scene, or what else a format gives, or raises the error of the format."""
 
-    def __call__(self) -> Scene: ...
+    def __call__(self) -> Scene | Any: ...
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,8 @@ class Format:
         read: the path of an input -> its scenes, each to be made.
         also_named: what an error may name instead of a file that is there.
         source: its name in :data:`~envs.sources.SOURCES`, if the converter reads it.
+        answer: what a broken input may end with.
+        check: what a sound result must pass; by default it is a scene.
     """
 
     name: str
@@ -51,6 +53,8 @@ class Format:
     read: Callable[[Path], Iterator[Maker]]
     also_named: tuple[str, ...] = ()
     source: str | None = None
+    answer: type[Exception] = SceneError
+    check: Callable[[Any], None] | None = None
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Reading one input and telling whether it went as it must: sound scenes, or one SceneError that names the file."""
+"""Reading one input and telling whether it went as it must: sound scenes, or one error that names the file."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class Verdict:
     """What came of one input.
 
     Attributes:
-        scenes: sound ones.
-        errors: kinds of SceneErrors.
+        scenes: sound ones, or what else a format gives.
+        errors: kinds of errors.
         fault: what must not be, or nothing.
     """
 
@@ -60,10 +60,11 @@ def judge(format: Format, case: Case, folder: Path) -> Verdict:
 
 
 def _read(format: Format, path: Path, names: Sequence[str], verdict: Verdict) -> None:
-    with _scene_errors(names, verdict):
+    check = format.check or _check_scene
+    with _scene_errors(names, verdict, format.answer):
         for make in islice(format.read(path), MOST_SCENES):
-            with _scene_errors(names, verdict):
-                _check_scene(make())
+            with _scene_errors(names, verdict, format.answer):
+                check(make())
                 verdict.scenes += 1
 
 
@@ -76,22 +77,22 @@ def _convert(format: Format, path: Path, names: Sequence[str], verdict: Verdict)
 
 
 class _scene_errors:
-    """Takes a SceneError as an answer, if it is a good one."""
+    """Takes the error of a format as an answer, if it is a good one."""
 
-    def __init__(self, names: Sequence[str], verdict: Verdict) -> None:
-        self.names, self.verdict = names, verdict
+    def __init__(self, names: Sequence[str], verdict: Verdict, answer: type[Exception] = SceneError) -> None:
+        self.names, self.verdict, self.answer = names, verdict, answer
 
     def __enter__(self) -> None: ...
 
     def __exit__(self, _, error: BaseException | None, __) -> bool:
-        if isinstance(error, SceneError):
+        if isinstance(error, self.answer):
             _check_error(error, self.names)
             self.verdict.errors.append(kind_of(str(error), self.names))
             return True
         return False
 
 
-def _check_error(error: SceneError, names: Sequence[str]) -> None:
+def _check_error(error: Exception, names: Sequence[str]) -> None:
     message = str(error)
     if not any(name in message for name in names):
         raise Fault(f"an error that names no file: {message[:300]}")

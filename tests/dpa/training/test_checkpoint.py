@@ -195,7 +195,7 @@ def test_a_policy_of_another_size_is_refused_naming_both_configurations_and_chan
 
 def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
     checkpoint = Checkpointer(tmp_path).save(1, {})
-    with pytest.raises(CheckpointError, match="is a training file; a policy file is needed"):
+    with pytest.raises(CheckpointError, match="is a 'training' file; a policy file is needed"):
         load_policy(checkpoint)
     torch.save({"weights": torch.zeros(1)}, tmp_path / "foreign.pt")
     with pytest.raises(CheckpointError, match="was not written by this version"):
