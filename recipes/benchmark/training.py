@@ -24,10 +24,9 @@ from dpa.policy import SIZES
 from dpa.report.curves import read_curves
 from dpa.training.run import SECONDS
 from envs.progress import progress
-from recipes.pretrain import __file__ as recipe
 
 BATCH = 8
-HERE = Path(recipe).parents[1]
+HERE = Path(__file__).parents[2]
 
 
 @dataclass(frozen=True)
