@@ -19,6 +19,7 @@ from recipes.common.cli import check_steps, told_of
 from recipes.common.limits import GROUPS, check_limits, is_number
 from recipes.common.models import policy_config
 from recipes.common.rankings import build_distance, ranking_options
+from recipes.experiment.jobs import reference_of
 from recipes.experiment.methods import read_setups
 from recipes.experiment.summary import labels
 
@@ -46,6 +47,7 @@ def check_experiment(cfg: DictConfig) -> None:
     RealismConfig.load(str(cfg.evaluation.metric))
     if not cfg.seeds or len(set(cfg.seeds)) < len(cfg.seeds):
         raise ValueError(f"seeds must be one or more, each once, got {list(cfg.seeds)}.")
+    _check_references(cfg)
     _check_decodings(cfg)
     check_collection(cfg.collection)
     _check_rankings(cfg)
@@ -65,6 +67,21 @@ def _check_keys(cfg: DictConfig) -> None:
         if unknown := sorted(given - taken):
             where = section or "the experiment"
             raise ValueError(f"{where} has no option {unknown[0]!r}; it takes {', '.join(sorted(taken))}.")
+
+
+def _check_references(cfg: DictConfig) -> None:
+    """Before any work: each is there and fits."""
+    each = cfg.reference if OmegaConf.is_list(cfg.reference) else [cfg.reference]
+    if cfg.reference is not None and not all(isinstance(name, str) for name in each):
+        raise ValueError(f"reference must be a file or zoo:NAME, a list of them, or null, got {cfg.reference!r}.")
+    if OmegaConf.is_list(cfg.reference) and len(cfg.reference) != len(cfg.seeds):
+        raise ValueError(
+            f"reference has {len(cfg.reference)} policies for the {len(cfg.seeds)} seeds {list(cfg.seeds)}; name one "
+            "for each, or one for all of them."
+        )
+    if cfg.reference is not None:
+        for seed in cfg.seeds:
+            reference_of(cfg, seed)
 
 
 def _check_decodings(cfg: DictConfig) -> None:

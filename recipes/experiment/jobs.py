@@ -17,7 +17,8 @@ from dpa.policy import Decoding
 from dpa.report.table import REFERENCE
 from dpa.training.loggers import read_curve
 from dpa.training.run import SECONDS
-from envs.files import write_json
+from envs.files import write_bytes, write_json
+from envs.options import differences
 from envs.seeding import make_generator
 from recipes.align import align
 from recipes.alignment.data import ON_POLICY
@@ -25,7 +26,7 @@ from recipes.alignment.likelihoods import PROBED, divergence, make_probes, probe
 from recipes.alignment.watch import Watch
 from recipes.collect import collect
 from recipes.common.cli import finished, finite, told_of
-from recipes.common.models import open_policy, weights_digest
+from recipes.common.models import open_policy, policy_config, policy_file, weights_digest
 from recipes.common.rankings import TimedDistance, build_distance, open_ranked_scenes, ranking_options
 from recipes.common.scenes import fingerprint, open_splits
 from recipes.evaluate import evaluate, mean_known
@@ -36,10 +37,42 @@ from recipes.rerank import rerank
 
 
 def pretrain_job(cfg: DictConfig, seed: int) -> dict[str, float]:
-    """Reference of one seed."""
+    """Reference of one seed, trained or taken over."""
     folder = runs_of(cfg).training(seed, REFERENCE)
+    if cfg.reference is not None:
+        adopt(reference_of(cfg, seed), folder / "policy.pt")
+        return {}
     pretrain(cfg, open_splits(cfg.scenes), seed, folder)
     return {"pretrain": seconds_trained(folder)}
+
+
+def reference_of(cfg: DictConfig, seed: int) -> Path:
+    """The file of the policy that takes the place of a trained reference.
+
+    Raises:
+        ValueError: the zoo has none of this name, or its options are not those of ``model``.
+    """
+    named = cfg.reference if isinstance(cfg.reference, str) else cfg.reference[list(cfg.seeds).index(seed)]
+    path = policy_file(named)
+    _, _, config = open_policy(path)
+    if differ := differences(config, policy_config(cfg.model)):
+        raise ValueError(f"reference={named} was made with other options than the section model ({differ}).")
+    return path
+
+
+def adopt(policy: Path, place: Path) -> None:
+    """Take over a policy as it is; a place that holds another one is refused.
+
+    Raises:
+        ValueError: it does.
+    """
+    content = policy.read_bytes()
+    if place.is_file() and place.read_bytes() != content:
+        raise ValueError(
+            f"{place} is another policy than reference={policy}; name another output, or remove {place.parent.parent}."
+        )
+    place.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(place, content)
 
 
 def collect_job(cfg: DictConfig, seed: int, split: str, source: str) -> dict[str, float]:
