@@ -2,7 +2,7 @@
 
     python -m recipes.pretrain                                   # SUMO scenes, made on the spot
     python -m recipes.pretrain scenes=gpudrive scenes.train=DIR scenes.eval=DIR output=runs/reference
-    python -m recipes.pretrain pretraining.start=zoo:motionlm-nano-sumo pretraining.lr=3e-4 scenes=...  # goes on
+    python -m recipes.pretrain model=nano model.context.max_pieces=256 pretraining.start=zoo:motionlm-nano-sumo
     torchrun --nproc-per-node 8 -m recipes.pretrain device=cuda pretraining.batch_size=64  # docs/scale.md
 
 The weights that are best on the tuning scenes become ``policy.pt``. Run the same command again to go on after a kill.

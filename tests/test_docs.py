@@ -44,6 +44,7 @@ from recipes.plan import make_parser as plan_parser
 from recipes.report import make_parser as report_parser
 from recipes.studies import spurious
 from recipes.studies.study import as_json
+from recipes.zoo import make_parser as zoo_parser
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 CONFIG = REPOSITORY / "recipes" / "config"
@@ -146,9 +147,14 @@ def extra_configurations(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-PLAIN = ("recipes.benchmark", "recipes.difference", "recipes.plan", "recipes.report")
+PLAIN = ("recipes.benchmark", "recipes.difference", "recipes.plan", "recipes.report", "recipes.zoo")
 """Recipes whose arguments are no options of a configuration."""
 BENCHMARKS = [command for command in COMMANDS if command.startswith("recipes.benchmark ")]
+
+
+@pytest.mark.parametrize("command", [command for command in COMMANDS if command.startswith("recipes.zoo")])
+def test_the_zoo_takes_the_options_that_a_command_gives(command: str) -> None:
+    zoo_parser().parse_args(shlex.split(command)[1:])
 
 
 @pytest.mark.parametrize("command", BENCHMARKS)
@@ -362,6 +368,8 @@ def test_the_study_beside_the_results_has_the_options_that_its_command_gives(stu
     for experiment in study.experiments.values():
         given = OmegaConf.to_container(options_told(experiment.scenes["source"], experiment.name), resolve=True)
         made = json.loads((study.folder / "experiments" / f"{experiment.name}.json").read_text())["config"]
+        for newer in ("start", "keep_gib"):  # neither changes what a training without a start comes to
+            given["pretraining"].pop(newer)
         for name in ("seeds", "model", "pretraining", "collection", "alignment", "evaluation", "decoding", "rankings"):
             assert made[name] == given[name], name
         for name in ("methods", "experiment", "aligned_scenes", "drift_rollouts", "device", "threads"):

@@ -40,7 +40,7 @@ def card(name: str, folder: Path = FOLDER) -> dict[str, Any]:
 
     Examples:
         >>> card("motionlm-nano-sumo")["parameters"]
-        152842
+        153297
     """
     file = _folder_of(name, folder) / CARD
     try:

@@ -92,7 +92,7 @@ def test_keys_can_be_set_to_nested_ones(network: tuple, logs: TensorDict) -> Non
     loss = NextTokenLoss(network[0])
     expected = loss(logs)
     renamed = {name: ("data", name) for name in ("context", "tokens", "token_valid")}
-    loss.set_keys(**renamed, labels=renamed["tokens"])
+    loss.set_keys(**renamed, labels=renamed["tokens"], learnt=renamed["token_valid"])
     assert loss.in_keys == list(renamed.values())
     nested = TensorDict({key: logs[name] for name, key in renamed.items()}, batch_size=logs.batch_size)
     assert (loss(nested) == expected).all()
