@@ -84,6 +84,21 @@ class RolloutJob:
         check_precision(self.precision)
 
 
+def make_env(part: Subset, options: ContextOptions, num_rollouts: int, device: str) -> TrafficEnv:
+    """The environment of some scenes side by side, for a policy that sees them as the options say."""
+    return TrafficEnv(
+        part,
+        num_scenes=len(part),
+        num_rollouts=num_rollouts,
+        control=options.control,
+        arrivals=options.arrivals,
+        max_controlled=options.max_controlled,
+        decision_steps=options.decision_steps,
+        horizon=options.horizon,
+        device=device,
+    )
+
+
 class RolloutWorker:
     """Rolls tasks out, one after the other.
 
@@ -126,17 +141,7 @@ class RolloutWorker:
 
     def _piece(self, part: Subset, contexts: Contexts, piece: range) -> TensorDictBase:
         job, options = self.job, self.job.options
-        env = TrafficEnv(
-            part,
-            num_scenes=len(part),
-            num_rollouts=len(piece),
-            control=options.control,
-            arrivals=options.arrivals,
-            max_controlled=options.max_controlled,
-            decision_steps=options.decision_steps,
-            horizon=options.horizon,
-            device=job.device,
-        )
+        env = make_env(part, options, len(piece), job.device)
         actor = MotionActor(
             self.model,
             contexts,

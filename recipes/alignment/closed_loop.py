@@ -15,14 +15,13 @@ from dpa.policy import ContextOptions, MotionLM
 from dpa.policy.actor import Contexts
 from dpa.policy.closest import ClosestActor
 from dpa.policy.context import collate_contexts
-from dpa.rollout.job import Subset
+from dpa.rollout.job import Subset, make_env
 from dpa.tokens import TokenAction
 from dpa.training.batches import ShuffledOrder, micro_batches
 from dpa.training.distributed import ALONE, Ranks
 from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
 from envs import keys
 from envs.scene import SceneSource
-from envs.traffic import TrafficEnv
 
 
 class ClosedLoopStep:
@@ -88,16 +87,7 @@ class ClosedLoopStep:
     def _follow(self, indices: Sequence[int]) -> TensorDict:
         """Tokens, labels, and which of both count: each ``[S, 1, A, T]``."""
         part, options = Subset(self.scenes, indices), self.contexts.options
-        env = TrafficEnv(
-            part,
-            num_scenes=len(part),
-            control=options.control,
-            arrivals=options.arrivals,
-            max_controlled=options.max_controlled,
-            decision_steps=options.decision_steps,
-            horizon=options.horizon,
-            device=self.device,
-        )
+        env = make_env(part, options, 1, self.device)
         actor = ClosestActor(self.model, _Part(self.contexts, indices), candidates=self.candidates)
         rolled = TransformedEnv(env, TokenAction(self.model.tokenizer)).rollout(options.horizon, actor)
         there = rolled[keys.CONTROLLED] & rolled[keys.VALID]
