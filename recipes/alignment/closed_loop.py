@@ -71,8 +71,8 @@ class ClosedLoopStep:
             step: counted from 0.
 
         Returns:
-            What the loss logs, ``gradient_norm`` before clipping, and ``followed``: the share of labels that the
-            policy has among its candidates.
+            What the loss logs, ``gradient_norm`` before clipping, and ``followed``: the share of labels that
+            are the tokens that were taken.
         """
         indices = self.ranks.mine(self.order(step))
         with without_dropout(self.model):
