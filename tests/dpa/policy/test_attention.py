@@ -33,7 +33,9 @@ def tokens(num: int, seed: int = 0, width: int = WIDTH) -> tuple[Tensor, Tensor]
 
 def seen_from(attention: RelativeAttention, channels: Tensor, relative: Tensor) -> Tensor:
     """``[H, D]`` channels of one token as they appear from another one: vectors turned and shifted."""
-    vector, weight, rest = attention._blocks(channels)
+    blocks = attention.blocks
+    vector, weight, rest = channels.split((2 * blocks, blocks, attention.dim - 3 * blocks), -1)
+    vector = vector.unflatten(-1, (blocks, 2))
     angle = relative[2].expand(vector.shape[:-1])
     vector = rotate(vector, angle) + weight[..., None] * relative[:2] / METRES
     return torch.cat((vector.flatten(-2), weight, rest), -1)
@@ -118,9 +120,10 @@ def test_at_the_start_of_training_the_gaze_rests_on_the_agent_itself() -> None:
     assert narrow[0] > wide[0] > 0.5
 
 
-def test_a_width_that_heads_do_not_divide_is_refused() -> None:
-    with pytest.raises(ValueError, match="multiple of heads, got 32 and 3"):
-        RelativeAttention(32, heads=3)
+@pytest.mark.parametrize(("width", "heads"), [(32, 3), (30, 2)])
+def test_heads_without_an_even_number_of_channels_are_refused(width: int, heads: int) -> None:
+    with pytest.raises(ValueError, match=f"multiple of twice the heads, got {width} and {heads}"):
+        RelativeAttention(width, heads=heads)
 
 
 # --- between nodes --------------------------------------------------------------------------------------------------
