@@ -141,8 +141,9 @@ def make_step(
     if method.data.kind in ON_POLICY:
         check_data(method.data, 0)
         loss.set_keys(labels=keys.LABELS, learnt=keys.LEARNT)
-        scenes, candidates = inputs.scenes.subset(inputs.learnt), method.data.candidates
-        return ClosedLoopStep(model, ranks.wrap(loss), scenes, inputs.context, candidates, options, seed, device, ranks)
+        scenes = inputs.scenes.subset(inputs.learnt)
+        follow = {"candidates": method.data.candidates, "recovery": method.data.recovery}
+        return ClosedLoopStep(model, ranks.wrap(loss), scenes, inputs.context, follow, options, seed, device, ranks)
     candidates = inputs.candidates(method.data, seed)
     return AlignmentStep(model, ranks.wrap(loss), candidates, options, seed, device, ranks)
 

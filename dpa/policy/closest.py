@@ -10,16 +10,20 @@ from dpa.policy.actor import Contexts, MotionActor
 from dpa.policy.motionlm import MotionLM
 from envs import keys
 from envs.geometry.boxes import box_corners
-from envs.geometry.frames import to_local
+from envs.geometry.frames import to_local, to_world
 
 
 class ClosestActor(MotionActor):
     """Takes, of its K most probable tokens, the one that ends nearest to the log, and says which token would be best.
 
     So it visits states that it drives into by itself, and never strays far from where the log still has an answer
-    (closest among top-K, Zhang et al., CVPR 2025, section 4). How far two ends are apart is the mean distance of the
-    corners of the agent's box. Where the log has no pose at the end of a decision, the most probable token is taken,
-    and there is no label.
+    (closest among top-K, Zhang et al., CVPR 2025, section 4). The best token is what the tokenizer makes of the motion
+    to the target; where it is none of the K, the one whose box ends nearest, by the mean distance of corners, is taken.
+    Where the log has no pose at the end of a decision, the most probable token is taken, and there is no label.
+
+    The paper's target is the log. Tokens that change a velocity must undo at once what they do to be back there, so
+    with them it pays to come back slowly: ``recovery`` is the share of the offset from the log, seen from the log's own
+    pose, that one decision makes good.
 
     Args:
         model: the distribution.
@@ -27,9 +31,10 @@ class ClosestActor(MotionActor):
 
     Keyword Args:
         candidates: K; the paper has 32.
+        recovery: above 0, and 1 for the log itself, as in the paper.
 
     Raises:
-        ValueError: no such number of tokens.
+        ValueError: no such number of tokens, or no such share.
 
     Beside what a :class:`~dpa.policy.MotionActor` writes stand ``label`` and ``label_valid`` of each agent. Nothing is
     drawn; ``sampling_log_prob`` is 0.
@@ -47,13 +52,15 @@ class ClosestActor(MotionActor):
         tensor(True)
     """
 
-    def __init__(self, model: MotionLM, contexts: Contexts, *, candidates: int = 32) -> None:
+    def __init__(self, model: MotionLM, contexts: Contexts, *, candidates: int = 32, recovery: float = 1.0) -> None:
         super().__init__(model, contexts)
         if not 1 <= candidates <= model.tokenizer.vocab_size:
             raise ValueError(
                 f"candidates must be 1 to {model.tokenizer.vocab_size}, the number of tokens, got {candidates}."
             )
-        self.candidates = candidates
+        if not 0 < recovery <= 1:
+            raise ValueError(f"recovery must lie in (0, 1], got {recovery}.")
+        self.candidates, self.recovery = candidates, recovery
         self.out_keys = [*self.out_keys, keys.LABEL, keys.LABEL_VALID]
 
     @torch.no_grad()
@@ -62,23 +69,30 @@ class ClosestActor(MotionActor):
         logits = self.logits(tensordict).float()
         recent, kind = tensordict[keys.RECENT], tensordict[keys.KIND]
         target, logged = self._target(tensordict[keys.STEP][:, 0], recent)
+        label = self.model.tokenizer.encode(target, recent, kind)
         likely = logits.topk(self.candidates).indices
-        chosen = torch.where(logged, self._apart(likely, target, recent, kind).argmin(-1), 0)
+        apart = self._apart(likely, target, recent, kind).masked_fill(likely == label[..., None], -1.0)
+        chosen = torch.where(logged, apart.argmin(-1), 0)
         token = likely.gather(-1, chosen[..., None])[..., 0]
         self._last = token
         tensordict[keys.TOKEN] = token
         tensordict[keys.LOG_PROB] = logits.log_softmax(-1).gather(-1, token[..., None])[..., 0]
         tensordict[keys.SAMPLING_LOG_PROB] = torch.zeros_like(tensordict[keys.LOG_PROB])
-        tensordict[keys.LABEL] = self.model.tokenizer.encode(target, recent, kind)
+        tensordict[keys.LABEL] = label
         tensordict[keys.LABEL_VALID] = logged & tensordict[keys.CONTROLLED]
         return tensordict
 
     def _target(self, step: Tensor, recent: Tensor) -> tuple[Tensor, Tensor]:
-        """``[B, A, F, 3]``: logged poses of the decision in the agents' own frames; ``[B, A]``: the last is known."""
-        steps, rows = self.model.tokenizer.steps, torch.arange(len(step), device=step.device)
-        decisions = self._context.logged.unflatten(2, (-1, steps)), self._context.logged_valid.unflatten(2, (-1, steps))
-        poses, valid = (value[rows // self.num_rollouts, :, step] for value in decisions)
-        return to_local(poses, recent[..., -1:, :]), valid[..., -1]
+        """``[B, A, F, 3]``: where to be, in the agents' own frames; ``[B, A]``: the log knows the decision's end."""
+        steps, rows = self.model.tokenizer.steps, torch.arange(len(step), device=step.device) // self.num_rollouts
+        decisions = (each.unflatten(2, (-1, steps)) for each in (self._context.logged, self._context.logged_valid))
+        logged, valid = (each[rows] for each in decisions)  # [B, A, T, F, ...]
+        each = torch.arange(len(step), device=step.device)
+        poses, current, before = logged[each, :, step], recent[..., -1, :], (step - 1).clamp(min=0)
+        # Nothing is left of the offset where the log had no pose to be beside, nor before the first decision.
+        beside = valid[each, :, before, -1] & (step > 0)[:, None]
+        left = (1 - self.recovery) * to_local(current, logged[each, :, before, -1]) * beside[..., None]
+        return to_local(to_world(left[..., None, :], poses), current[..., None, :]), valid[each, :, step, -1]
 
     def _apart(self, tokens: Tensor, target: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
         """``[B, A, K]``: mean distance of the box's corners at the ends of tokens from those at the target [m]."""

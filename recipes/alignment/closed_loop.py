@@ -35,7 +35,7 @@ class ClosedLoopStep:
         loss: of a batch, with ``labels`` and ``learnt``; a loss module, or what the ranks wrapped it into.
         scenes: to learn from.
         context: how they are cut up.
-        candidates: K of :class:`~dpa.policy.closest.ClosestActor`.
+        follow: ``candidates`` and ``recovery`` of :class:`~dpa.policy.closest.ClosestActor`.
         options: the section ``alignment``.
         seed: of the order of scenes.
         device: of rollouts and batches.
@@ -52,14 +52,14 @@ class ClosedLoopStep:
         loss: Callable[[TensorDictBase], TensorDictBase],
         scenes: SceneSource,
         context: ContextOptions,
-        candidates: int,
+        follow: dict[str, float],
         options: DictConfig,
         seed: int,
         device: str,
         ranks: Ranks = ALONE,
     ) -> None:
         self.model, self.loss, self.scenes, self.contexts = model, loss, scenes, Contexts(scenes, context)
-        self.candidates, self.options, self.device, self.ranks = candidates, options, device, ranks
+        self.follow, self.options, self.device, self.ranks = follow, options, device, ranks
         self.optimizer = make_optimizer(model, options.lr, options.weight_decay)
         self.schedule = make_schedule(self.optimizer, options.steps, options.warmup)
         self.order = ShuffledOrder(len(scenes), options.scenes_per_step, seed)
@@ -88,7 +88,7 @@ class ClosedLoopStep:
         """Tokens, labels, and which of both count: each ``[S, 1, A, T]``."""
         part, options = Subset(self.scenes, indices), self.contexts.options
         env = make_env(part, options, 1, self.device)
-        actor = ClosestActor(self.model, _Part(self.contexts, indices), candidates=self.candidates)
+        actor = ClosestActor(self.model, _Part(self.contexts, indices), **self.follow)
         rolled = TransformedEnv(env, TokenAction(self.model.tokenizer)).rollout(options.horizon, actor)
         there = rolled[keys.CONTROLLED] & rolled[keys.VALID]
         found = {

@@ -28,7 +28,7 @@ READ = {
     "ranking": ("rank_by", "num"),
     "adversarial": ("num",),
     "expert": ("num",),
-    "closed_loop": ("candidates",),
+    "closed_loop": ("candidates", "recovery"),
 }
 """Options of each beside ``kind``."""
 PAIRS = ("nearest_farthest", "random", "all")
@@ -103,6 +103,8 @@ def _check(data: DictConfig, held: int, given: DictConfig) -> None:
     if data.kind in ON_POLICY:
         if type(data.get("candidates")) is not int or data.candidates < 1:
             raise ValueError(f"method.data.candidates must be 1 or more, got {data.get('candidates')!r}.")
+        if not isinstance(data.get("recovery"), int | float) or not 0 < data.recovery <= 1:
+            raise ValueError(f"method.data.recovery must lie in (0, 1], got {data.get('recovery')!r}.")
         return
     if data.kind in RANKED and data.rank_by not in (keys.DISTANCE, keys.ADE):
         raise ValueError(f"method.data.rank_by must be distance or ade, got {data.rank_by!r}.")

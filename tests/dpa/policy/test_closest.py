@@ -14,6 +14,7 @@ from dpa.tokens import TokenAction, VerletTokenizer
 from dpa.training.logs import log_item
 from envs import keys
 from envs.geometry.boxes import box_corners
+from envs.geometry.frames import to_local, to_world
 from envs.scene import Scene
 from envs.sources.synthetic import build_scene, straight_road
 from envs.traffic import TrafficEnv
@@ -26,10 +27,10 @@ def policy() -> MotionLM:
     return MotionLM("nano", TOKENIZER).eval()
 
 
-def followed(scenes: list[Scene], candidates: int, num_rollouts: int = 1) -> TensorDictBase:
+def followed(scenes: list[Scene], candidates: int, num_rollouts: int = 1, recovery: float = 1.0) -> TensorDictBase:
     sizes = {"num_scenes": len(scenes), "num_rollouts": num_rollouts}
     env = TransformedEnv(TrafficEnv(scenes, **sizes), TokenAction(TOKENIZER))
-    actor = ClosestActor(policy(), Contexts(scenes), candidates=candidates)
+    actor = ClosestActor(policy(), Contexts(scenes), candidates=candidates, recovery=recovery)
     actor.num_rollouts = num_rollouts
     return env.rollout(16, actor)
 
@@ -66,7 +67,28 @@ def test_the_taken_token_ends_nearest_to_the_log_among_the_likely_ones() -> None
             boxes = (torch.cat((pose, context.extent[agent, :2])) for pose in (end, context.logged[agent, 4]))
             mine, logs = (box_corners(box) for box in boxes)
             apart.append((mine - logs).norm(dim=-1).mean())
-        assert rolled[keys.TOKEN][0, 0, agent] == likely[agent][torch.stack(apart).argmin()]
+        label = rolled[keys.LABEL][0, 0, agent]
+        nearest = label if label in likely[agent] else likely[agent][torch.stack(apart).argmin()]
+        assert rolled[keys.TOKEN][0, 0, agent] == nearest
+
+
+def test_slow_recovery_aims_at_the_log_moved_by_what_is_left_of_the_offset() -> None:
+    """By hand, for the second decision: the target lies beside the log's next pose as the agent lies beside the log."""
+    scene, context = straight_road(3, seed=5), make_context(straight_road(3, seed=5))
+    rolled = followed([scene], candidates=2, recovery=0.25)
+    for agent in range(3):
+        recent, kind = context.recent[agent], context.kind[agent]
+        recent = TOKENIZER.advance(rolled[keys.TOKEN][0, 0, agent][None], recent[None], kind[None])[0]
+        offset = to_local(recent[-1], context.logged[agent, 4])
+        target = to_world(0.75 * offset, context.logged[agent, 5:10])
+        label = TOKENIZER.encode(to_local(target, recent[-1])[None], recent[None], kind[None])
+        assert rolled[keys.LABEL][0, 1, agent] == label
+
+
+@pytest.mark.parametrize("recovery", [0.0, 1.5])
+def test_a_share_that_cannot_be_made_good_is_refused(recovery: float) -> None:
+    with pytest.raises(ValueError, match=rf"recovery must lie in \(0, 1\], got {recovery}"):
+        ClosestActor(policy(), Contexts([straight_road(1)]), recovery=recovery)
 
 
 def test_where_the_log_ends_the_most_probable_token_is_taken_and_there_is_no_label() -> None:
