@@ -53,6 +53,7 @@ SECTIONS = {
     "rerank": ("threads", "scenes"),
     "spread": ("threads", "scenes"),
     "ladder": ("threads", "scenes", "model"),
+    "gap": ("threads", "scenes"),
     "tokens": ("threads", "scenes", "model"),
     "look": ("threads", "scenes"),
     "validity": ("threads", "scenes"),

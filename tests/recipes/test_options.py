@@ -24,7 +24,9 @@ from recipes.common.partial import PartialResult
 from recipes.common.scenes import fingerprint, open_splits
 from recipes.studies.motions import MotionShelf
 
-RECIPES = ("pretrain", "collect", "align", "evaluate", "play", "ladder", "tokens", "compare", "validity", "sensitivity")
+RECIPES = (
+    "pretrain", "collect", "align", "evaluate", "play", "ladder", "gap", "tokens", "compare", "validity", "sensitivity"
+)  # fmt: skip
 WITHOUT_POLICY = ("pretrain", "ladder", "tokens", "compare", "play", "validity", "sensitivity")
 pytestmark = pytest.mark.usefixtures("stores")
 

@@ -1,0 +1,219 @@
+"""What lies between a policy and the log: its tokens, its own errors, errors that add up, or the other agents.
+
+python -m recipes.gap policies=[zoo:motionlm-nano-sumo]
+
+One agent of each scene, the self-driving car, is looked at in the same place four times: it follows the log by tokens;
+it takes single decisions from the log, each from where the log is; it drives alone while the log replays all others;
+and it drives among agents of the same policy. What grows from one row to the next is the share of each cause. Run the
+same command again to go on after a kill: rows that are there are read back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import hydra
+import numpy as np
+import torch
+from omegaconf import DictConfig
+from torch import Tensor
+
+from dpa.policy import ContextOptions, Decoding, MotionLM, collate_contexts, make_context
+from dpa.policy.sampling import draw
+from dpa.realism import RealismConfig
+from dpa.realism.features import measure
+from dpa.realism.tracks import compare
+from dpa.report.statistics import summary
+from dpa.rollout import lifted, make_collector
+from dpa.tokens import MotionTokenizer
+from envs.files import write_json
+from envs.geometry.frames import to_world
+from envs.progress import progress
+from envs.scene import STEP_SECONDS, Scene, SceneSource
+from envs.seeding import make_generator
+from recipes.common.cli import CONFIG, build, finished, plain, recipe
+from recipes.common.models import open_policy, policies_of, weights_digest
+from recipes.common.rolled import rolled
+from recipes.common.scenes import fingerprint, open_splits
+from recipes.studies.tables import StudyTable, tell
+
+Rolls = Iterator[tuple[int, Tensor]]
+"""Index of a scene and its trajectories ``[R, A, 80, 4]``."""
+SECONDS = (2.0, 8.0)
+"""When it is looked at what has happened so far."""
+
+
+def logs(scenes: SceneSource, tokenizer: MotionTokenizer | None) -> Rolls:
+    """The log of every scene; where a tokenizer is given, that of the self-driving car as its tokens have it."""
+    for index in range(len(scenes)):
+        scene = scenes[index]
+        context = make_context(scene, ContextOptions(control="sdc"))
+        poses = context.logged
+        if tokenizer is not None:
+            tracks = tokenizer.encode_tracks(poses, context.logged_valid, context.recent, context.kind)
+            poses = torch.where(context.controlled[:, None, None], tracks.poses, poses)
+        yield index, lifted(scene, poses[None])
+
+
+def single_decisions(
+    scenes: SceneSource, model: MotionLM, options: ContextOptions, decoding: Decoding, cfg: DictConfig
+) -> Rolls:
+    """Every decision of the self-driving car taken from where the log, through its tokens, has brought it."""
+    options, tokenizer = replace(options, control="sdc"), model.tokenizer
+    for index in range(len(scenes)):
+        scene = scenes[index]
+        context = make_context(scene, options)
+        tracks = tokenizer.encode_tracks(context.logged, context.logged_valid, context.recent, context.kind)
+        with torch.no_grad():
+            batch = collate_contexts([context]).to(cfg.device)
+            seen = (each.to(cfg.device) for each in (tracks.tokens[None, None], tracks.valid[None, None]))
+            log_probs = decoding.log_probs(model(batch, *seen).float())[0, 0].cpu()  # [A, T, V]
+        uniform = torch.rand(
+            cfg.num_rollouts, *log_probs.shape[:-1], generator=make_generator(cfg.seed, "gap", scene.scene_id)
+        )
+        tokens = draw(log_probs.expand(cfg.num_rollouts, *log_probs.shape), uniform)
+        before = torch.cat((context.recent, tracks.poses), 1).unfold(1, tokenizer.steps + 1, tokenizer.steps)
+        before = before.movedim(-1, -2)[:, : tokens.shape[-1]].expand(*tokens.shape, -1, -1)
+        kind = context.kind[:, None].expand_as(tokens)
+        moved = to_world(tokenizer.decode(tokens, before, kind), before[..., -1:, :]).flatten(2, 3)
+        yield index, lifted(scene, torch.where(context.controlled[:, None, None], moved, context.logged))
+
+
+def driven(scenes: SceneSource, model: MotionLM, options: ContextOptions, decoding: Decoding, cfg: DictConfig) -> Rolls:
+    """Rollouts of every scene by the policy, as ``options.control`` says who is driven."""
+    batches = make_collector(
+        scenes,
+        model,
+        num_rollouts=cfg.num_rollouts,
+        decoding=decoding,
+        options=options,
+        seed=cfg.seed,
+        memory=cfg.memory,
+        device=cfg.device,
+    )
+    return ((each.index, each.trajectories) for each in rolled(batches, scenes, cfg.num_rollouts))
+
+
+def rows(cfg: DictConfig) -> Iterator[tuple[str, dict[str, Any], Callable[[SceneSource], Rolls]]]:
+    """Name of each row, what decides it, and its rollouts."""
+    decoding, told = build(Decoding, cfg.decoding, "decoding"), {"decoding": plain(cfg.decoding)}
+    policies = {name: open_policy(path, cfg.device) for name, path in policies_of(cfg).items()}
+    several = len(policies) > 1
+    yield "log", {}, lambda scenes: logs(scenes, None)
+    first, _, config = next(iter(policies.values()))
+    yield "log through tokens", {"tokenizer": config["tokenizer"]}, lambda scenes: logs(scenes, first.tokenizer)
+    for name, (model, options, config) in policies.items():
+        own = told | {"policy": weights_digest(model), **config}
+        alone, among = replace(options, control="sdc"), replace(options, control="all")
+        for row, roll in (
+            ("single decisions", lambda s, m=model, o=options: single_decisions(s, m, o, decoding, cfg)),
+            ("alone", lambda s, m=model, o=alone: driven(s, m, o, decoding, cfg)),
+            ("among its own", lambda s, m=model, o=among: driven(s, m, o, decoding, cfg)),
+        ):
+            yield f"{name}: {row}" if several else row, own, roll
+
+
+def look(scene: Scene, trajectories: Tensor, metric: RealismConfig) -> dict[str, float]:
+    """What becomes of the self-driving car by each of :data:`SECONDS`; shares and means over rollouts.
+
+    Args:
+        scene: uncollated.
+        trajectories: ``[R, A, 80, 4]`` of the present agents.
+        metric: whose measurements these are.
+
+    Returns:
+        ``collision``, ``off-road`` and ``away`` (from the log [m]), each ``at`` some seconds.
+
+    Raises:
+        ValueError: the scene has no self-driving car.
+    """
+    comparison = compare(scene, trajectories, metric)
+    measured, agents = measure([comparison], metric)[0], scene.agents
+    row = torch.isin(measured.track_id, agents.track_id[agents.sdc]).nonzero()
+    if len(row) != 1:
+        raise ValueError(f"scene {scene.scene_id} has no self-driving car; leave it out.")
+    row, there = int(row), measured.scored[int(row)]
+    logged = comparison.scene.agents.position[row, -len(there) :, :2]
+    away = (comparison.simulated[:, row, :, :2] - logged).norm(dim=-1)
+    found = {}
+    for name, event in (("collision", "collision_per_step"), ("off-road", "offroad_per_step")):
+        happened = (measured.values[event][1:, row] & there).float().cummax(-1).values.mean(0)
+        found |= {f"{name} {seconds:g} s": happened[_last(seconds)].item() for seconds in SECONDS}
+    for seconds in SECONDS:
+        known = there[_last(seconds)]
+        found[f"away {seconds:g} s [m]"] = away[:, _last(seconds)].mean().item() if known else float("nan")
+    return found
+
+
+def _last(seconds: float) -> int:
+    return round(seconds / STEP_SECONDS) - 1
+
+
+def score(scenes: SceneSource, rolls: Rolls, metric: RealismConfig, name: str) -> dict[str, list[float | None]]:
+    """Each figure of :func:`look` as one value per scene; None where the log has left by then."""
+    found: dict[int, dict[str, float]] = {}
+    with progress(total=len(scenes), description=name, unit="scene") as bar:
+        for index, trajectories in rolls:
+            found[index] = look(scenes[index], trajectories, metric)
+            bar.update()
+    ordered = [found[index] for index in sorted(found)]
+    return {key: [None if np.isnan(each[key]) else each[key] for each in ordered] for key in ordered[0]}
+
+
+def measure_gap(cfg: DictConfig, scenes: SceneSource) -> dict[str, dict[str, list[float | None]]]:
+    """Score every row, or read it back; ``{row: {figure: one value per scene}}``.
+
+    Raises:
+        ValueError: a row was scored with other options.
+    """
+    metric = RealismConfig.load(str(cfg.metric))
+    common = {
+        "scenes": fingerprint(scenes),
+        "num_rollouts": cfg.num_rollouts,
+        "seed": cfg.seed,
+        "metric": metric.describe(),
+    }
+    gap = {}
+    for name, own, roll in rows(cfg):
+        path = Path(cfg.output) / f"{name.replace(':', '').replace(' ', '_').replace('/', '_')}.json"
+        done = finished(path, common | own)
+        if done is None:
+            done = {"options": common | own, "figures": score(scenes, roll(scenes), metric, name)}
+            write_json(path, done)
+        gap[name] = done["figures"]
+    return gap
+
+
+def table(gap: dict[str, dict[str, list[float | None]]], num_scenes: int) -> StudyTable:
+    """Every row's figures with intervals over scenes, each over those in which the log is still there."""
+    columns = list(next(iter(gap.values())))
+    rows = {
+        name: [
+            summary([[value for value in figures[column] if value is not None]])
+            if any(value is not None for value in figures[column])
+            else None
+            for column in columns
+        ]
+        for name, figures in gap.items()
+    }
+    return StudyTable(
+        "gap", f"the self-driving car in {num_scenes} scenes", ["driven by", *columns], rows, signed=False
+    )
+
+
+@hydra.main(**CONFIG, config_name="gap")
+@recipe
+def main(cfg: DictConfig) -> None:
+    """Entry point of ``python -m recipes.gap``."""
+    scenes = open_splits(cfg.scenes)[cfg.split]
+    gap = measure_gap(cfg, scenes)
+    tell(cfg, [table(gap, len(scenes))], {})
+    if cfg.json is not None:
+        write_json(cfg.json, {"scenes": len(scenes), "rows": gap})
+
+
+if __name__ == "__main__":
+    main()
