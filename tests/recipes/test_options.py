@@ -27,7 +27,7 @@ from recipes.studies.motions import MotionShelf
 RECIPES = (
     "pretrain", "collect", "align", "evaluate", "play", "ladder", "gap", "tokens", "compare", "validity", "sensitivity"
 )  # fmt: skip
-WITHOUT_POLICY = ("pretrain", "ladder", "tokens", "compare", "play", "validity", "sensitivity")
+WITHOUT_POLICY = ("pretrain", "ladder", "gap", "tokens", "compare", "play", "validity", "sensitivity")
 pytestmark = pytest.mark.usefixtures("stores")
 
 
