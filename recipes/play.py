@@ -1,10 +1,11 @@
-"""Look at what policies do: a page that plays some scenes, log beside rollouts, or a picture of the most likely ones.
+"""Look at what policies do: a page that plays some scenes, or a picture or film of the most likely rollouts.
 
     python -m recipes.play policies=[runs/pretrain/policy.pt,runs/dpa_omf/policy.pt]
     python -m recipes.play policies=[runs/pretrain/policy.pt,runs/dpa_omf/policy.pt] output=runs/likely.png
+    python -m recipes.play policies=[runs/pretrain/policy.pt,runs/dpa_omf/policy.pt] output=runs/likely.gif
 
 Of many rollouts of each scene and policy the page keeps a few: the most likely one, and some from the one nearest to
-the log to the farthest. The picture shows the most likely ones alone (figures 5 and 9 of the paper).
+the log to the farthest. The picture and the film show the most likely ones alone (figures 5 and 9 of the paper).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from torch import Tensor
 
 from dpa.policy import Decoding
 from dpa.ranking import Distance, PreferenceDistance
+from dpa.report.film import film_likely
 from dpa.report.judged import JudgedRollouts, judge_rollouts
 from dpa.report.likely import plot_likely
 from dpa.report.page import write_rollouts
@@ -34,6 +36,8 @@ from recipes.common.rolled import rolled
 from recipes.common.scenes import open_splits
 
 PAPER_DISTANCE = PreferenceDistance()
+DRAWN = {".png": plot_likely, ".gif": film_likely, ".mp4": film_likely}
+"""Endings of pictures of the most likely rollouts, and what makes them."""
 
 
 def roll_out(
@@ -137,8 +141,9 @@ def chosen_scenes(scenes: SceneStore, chosen: Sequence[int | str]) -> list[int]:
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.play``."""
-    if Path(cfg.output).suffix not in (".html", ".png"):
-        raise ValueError(f"output={cfg.output} is to be a page or a picture; name a file that ends in .html or .png.")
+    if Path(cfg.output).suffix not in (".html", *DRAWN):
+        known = ", ".join((".html", *DRAWN))
+        raise ValueError(f"output={cfg.output} is no page, picture or film; name a file that ends in one of {known}.")
     policies = policies_of(cfg)
     scenes = open_splits(cfg.scenes)[cfg.split]
     players = roll_out(
@@ -152,8 +157,8 @@ def main(cfg: DictConfig) -> None:
         seed=cfg.seed,
         device=cfg.device,
     )
-    if Path(cfg.output).suffix == ".png":
-        plot_likely(players, cfg.output)
+    if draw := DRAWN.get(Path(cfg.output).suffix):
+        draw(players, cfg.output)
         print(f"picture: {cfg.output}")
         return
     facts = {name: str(path) for name, path in policies.items()} | {

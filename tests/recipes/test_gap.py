@@ -53,7 +53,7 @@ def two_cars() -> Scene:
 
 
 def test_a_car_that_catches_up_collides_by_the_time_that_it_does() -> None:
-    """By hand: 30 m apart at the centres, 5 m/s too fast: bumpers of two cars of 4.5 m meet in the sixth second of eight."""
+    """By hand: 30 m apart at the centres, 5 m/s too fast: bumpers of 4.5 m cars meet in the sixth second."""
     scene = two_cars()
     faster = logged(scene).repeat(2, 1, 1, 1)
     faster[1, 0, :, 0] += 0.5 * torch.arange(1, 81)

@@ -1094,7 +1094,7 @@ def test_the_most_likely_rollouts_make_a_picture(run: Callable, options: Callabl
 
 def test_a_page_to_play_needs_the_name_of_one(run: Callable, options: Callable, runs: Path, tmp_path: Path) -> None:
     outcome = run("play", *options("play", f"policies={runs / 'reference/policy.pt'}", f"output={tmp_path / 'a.svg'}"))
-    assert outcome.status == 2 and "name a file that ends in .html or .png" in outcome.err
+    assert outcome.status == 2 and "name a file that ends in one of .html, .png, .gif, .mp4" in outcome.err
 
 
 def test_a_scene_to_play_that_is_not_there_is_told(
