@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import torch
 from tensordict import TensorDictBase
@@ -13,15 +13,25 @@ from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from dpa.training.distributed import ALONE, Ranks, without_sync
+from dpa.training.muon import Muon
 
 T = TypeVar("T")
+OPTIMIZERS = ("adamw", "muon")
+MUON_SIDE = 32
+"""Rows and columns that a matrix has at least to be made orthogonal; the thin ones of input features are AdamW's."""
 EMBEDDINGS = (nn.Embedding, nn.EmbeddingBag)
 BETAS = (0.9, 0.95)
 """Decay rates of AdamW's moments; 0.95 is usual for transformers, whose gradients have heavy tails."""
 
 
-def make_optimizer(module: nn.Module, lr: float, weight_decay: float, betas: tuple[float, float] = BETAS) -> AdamW:
-    """AdamW whose weight decay spares norms, biases and embeddings.
+def make_optimizer(
+    module: nn.Module,
+    lr: float,
+    weight_decay: float,
+    betas: tuple[float, float] = BETAS,
+    kind: Literal["adamw", "muon"] = "adamw",
+) -> AdamW:
+    """An optimiser whose weight decay spares norms, biases and embeddings.
 
     Decay pulls towards zero. That regularises the matrices of linear maps, but it shrinks the scale of a norm and the
     rows of tokens that a batch does not contain. Parameters of fewer than two dimensions, those of embedding modules,
@@ -32,15 +42,18 @@ def make_optimizer(module: nn.Module, lr: float, weight_decay: float, betas: tup
         lr: peak learning rate.
         weight_decay: decay of the matrices.
         betas: decay rates of the first and second moment.
+        kind: ``adamw``, or ``muon`` for the matrices and AdamW for the rest.
 
     Raises:
-        ValueError: no parameter of ``module`` needs a gradient.
+        ValueError: no parameter of ``module`` needs a gradient, or an unknown kind.
 
     Examples:
         >>> net = nn.Sequential(nn.Embedding(7, 4), nn.Linear(4, 4), nn.LayerNorm(4))
         >>> [(len(g["params"]), g["weight_decay"]) for g in make_optimizer(net, 1e-3, 0.1).param_groups]
         [(1, 0.1), (4, 0.0)]
     """
+    if kind not in OPTIMIZERS:
+        raise ValueError(f"the optimiser must be one of {', '.join(OPTIMIZERS)}, got {kind!r}.")
     embeddings = {id(p) for part in module.modules() if isinstance(part, EMBEDDINGS) for p in part.parameters()}
     decayed, spared = [], []
     for name, parameter in module.named_parameters():
@@ -50,8 +63,17 @@ def make_optimizer(module: nn.Module, lr: float, weight_decay: float, betas: tup
         (spared if spare else decayed).append(parameter)
     if not decayed and not spared:
         raise ValueError(f"{type(module).__name__} has no parameter that needs a gradient; unfreeze some of it.")
-    groups = [{"params": decayed, "weight_decay": weight_decay}, {"params": spared, "weight_decay": 0.0}]
-    return AdamW([group for group in groups if group["params"]], lr=lr, betas=betas, fused=True)
+    if kind == "adamw":
+        return AdamW(_group(decayed, weight_decay) + _group(spared, 0.0), lr=lr, betas=betas, fused=True)
+    wide = [each for each in decayed if each.ndim == 2 and min(each.shape) >= MUON_SIDE]
+    thin = [each for each in decayed if each.ndim != 2 or min(each.shape) < MUON_SIDE]
+    rest = _group(thin, weight_decay, orthogonal=False) + _group(spared, 0.0, orthogonal=False)
+    return Muon(_group(wide, weight_decay, orthogonal=True) + rest, lr=lr, betas=betas)
+
+
+def _group(parameters: list[nn.Parameter], weight_decay: float, **more: Any) -> list[dict[str, Any]]:
+    """One group, or none where there is no parameter."""
+    return [{"params": parameters, "weight_decay": weight_decay, **more}] if parameters else []
 
 
 def make_schedule(

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
+from dpa.training.optim import OPTIMIZERS
+
 
 class Limit(NamedTuple):
     """Values that an option may have.
@@ -21,6 +23,7 @@ class Limit(NamedTuple):
         above: the smallest value itself is not among them.
         empty: null is.
         many: it is a list, and these hold for each of its members.
+        among: names that it is one of; none given leaves them to whoever reads it.
     """
 
     kind: type
@@ -29,6 +32,7 @@ class Limit(NamedTuple):
     above: bool = False
     empty: bool = False
     many: bool = False
+    among: tuple[str, ...] = ()
 
 
 COUNT, NUMBER = Limit(int, least=1), Limit(int, least=0)
@@ -59,6 +63,7 @@ LIMITS: dict[str, Limit] = {
     **dict.fromkeys(BINS, POSITIVE._replace(many=True)),
     "grid": Limit(float, many=True),
     "start": Limit(str, empty=True),
+    "optimizer": Limit(str, among=OPTIMIZERS),
     "has_lights": FLAG._replace(empty=True),
     "rankings_per_scene": Limit(float, empty=True),
     "collection.workers": Limit(dict),
@@ -177,6 +182,8 @@ def _misfit(value: Any, limit: Limit) -> str | None:
         return None
     if not (is_number(value) if limit.kind is float else type(value) is limit.kind):
         return WORDS[limit.kind] + (" or null" if limit.empty else "")
+    if limit.among and value not in limit.among:
+        return f"one of {', '.join(limit.among)}"
     if limit.kind not in (int, float):
         return None
     if limit.above and value <= limit.least:
