@@ -140,9 +140,8 @@ class VerletTokenizer(MotionTokenizer):
         direction = torch.atan2(moves[..., 1], moves[..., 0]) + torch.pi * backward
         limit = self.turn[kind][..., None] * moves.norm(dim=-1)
         heading, headings = torch.zeros_like(direction[..., 0]), []
-        for step in range(self.steps):
-            change = wrap_angle(direction[..., step] - heading)
-            heading = heading + torch.maximum(torch.minimum(change, limit[..., step]), -limit[..., step])
+        for along, least, most in zip(direction.unbind(-1), (-limit).unbind(-1), limit.unbind(-1), strict=True):
+            heading = heading + wrap_angle(along - heading).clamp(least, most)
             headings.append(heading)
         return wrap_angle(torch.stack(headings, -1))
 
