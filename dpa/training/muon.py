@@ -13,8 +13,9 @@ MOMENTUM = 0.95
 COEFFICIENTS = (3.4445, -4.7750, 2.0315)
 """Of the quintic polynomial that lifts every singular value to about 1 in few rounds (Jordan et al. 2024)."""
 ROUNDS = 5
-RMS = 0.2
-"""Root mean square of the entries of an AdamW step in practice, at a learning rate of 1 (Liu et al. 2025)."""
+RMS = 0.6
+"""Root mean square of the entries of a step of matrices, at a learning rate of 1. A step of AdamW has 0.2 in practice
+(Liu et al. 2025); matrices bear three times as much, the other parameters do not (docs/results.md)."""
 
 
 def orthogonalised(matrix: Tensor, rounds: int = ROUNDS) -> Tensor:
@@ -44,8 +45,8 @@ class Muon(AdamW):
     """AdamW, but for groups of matrices marked ``orthogonal``, which follow their orthogonalised momentum.
 
     A step along the gradient is ruled by its few largest singular values; made orthogonal, it moves in all directions
-    of a matrix alike (Jordan et al. 2024, "Muon"). It is scaled to the root mean square of AdamW's, so that one
-    learning rate serves both (Liu et al. 2025, arXiv 2502.16982, section 2.2).
+    of a matrix alike (Jordan et al. 2024, "Muon"). Its root mean square does not depend on the shape and is three times
+    AdamW's, so that one learning rate serves both (Liu et al. 2025, arXiv 2502.16982, section 2.2, have it equal).
 
     Args:
         groups: of parameters, each with ``orthogonal``, true for a group of matrices.
