@@ -4,12 +4,16 @@ python -m recipes.gap policies=[zoo:motionlm-nano-sumo]
 
 One agent of each scene, the self-driving car, is looked at in the same place four times: it follows the log by tokens;
 it takes single decisions from the log, each from where the log is; it drives alone while the log replays all others;
-and it drives among agents of the same policy. What grows from one row to the next is the share of each cause. Run the
-same command again to go on after a kill: rows that are there are read back.
+and it drives among agents of the same policy. What grows from one row to the next is the share of each cause, but for
+one thing: replayed agents show the policy where they are, and no tokens, which it has hardly seen in training. Only
+agents whose log goes on to the end are looked at, so that nobody runs into one that is no longer there.
+
+Run the same command again to go on after a kill: rows that are there are read back.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -31,8 +35,9 @@ from dpa.rollout import lifted, make_collector
 from dpa.tokens import MotionTokenizer
 from envs.files import write_json
 from envs.geometry.frames import to_world
+from envs.options import differences
 from envs.progress import progress
-from envs.scene import STEP_SECONDS, Scene, SceneSource
+from envs.scene import STEP_SECONDS, Scene, SceneSource, select_agents
 from envs.seeding import make_generator
 from recipes.common.cli import CONFIG, build, finished, plain, recipe
 from recipes.common.models import open_policy, policies_of, weights_digest
@@ -46,11 +51,11 @@ SECONDS = (2.0, 8.0)
 """When it is looked at what has happened so far."""
 
 
-def logs(scenes: SceneSource, tokenizer: MotionTokenizer | None) -> Rolls:
+def logs(scenes: SceneSource, options: ContextOptions, tokenizer: MotionTokenizer | None) -> Rolls:
     """The log of every scene; where a tokenizer is given, that of the self-driving car as its tokens have it."""
     for index in range(len(scenes)):
         scene = scenes[index]
-        context = make_context(scene, ContextOptions(control="sdc"))
+        context = make_context(scene, replace(options, control="sdc"))
         poses = context.logged
         if tokenizer is not None:
             tracks = tokenizer.encode_tracks(poses, context.logged_valid, context.recent, context.kind)
@@ -62,7 +67,7 @@ def single_decisions(
     scenes: SceneSource, model: MotionLM, options: ContextOptions, decoding: Decoding, cfg: DictConfig
 ) -> Rolls:
     """Every decision of the self-driving car taken from where the log, through its tokens, has brought it."""
-    options, tokenizer = replace(options, control="sdc"), model.tokenizer
+    options, tokenizer = replace(options, control="sdc"), on_cpu(model.tokenizer)
     for index in range(len(scenes)):
         scene = scenes[index]
         context = make_context(scene, options)
@@ -82,6 +87,11 @@ def single_decisions(
         yield index, lifted(scene, torch.where(context.controlled[:, None, None], moved, context.logged))
 
 
+def on_cpu(tokenizer: MotionTokenizer) -> MotionTokenizer:
+    """A tokenizer beside the one of a model that may be elsewhere: scenes are cut up on the CPU."""
+    return copy.deepcopy(tokenizer).cpu()
+
+
 def driven(scenes: SceneSource, model: MotionLM, options: ContextOptions, decoding: Decoding, cfg: DictConfig) -> Rolls:
     """Rollouts of every scene by the policy, as ``options.control`` says who is driven."""
     batches = make_collector(
@@ -98,13 +108,20 @@ def driven(scenes: SceneSource, model: MotionLM, options: ContextOptions, decodi
 
 
 def rows(cfg: DictConfig) -> Iterator[tuple[str, dict[str, Any], Callable[[SceneSource], Rolls]]]:
-    """Name of each row, what decides it, and its rollouts."""
+    """Name of each row, what decides it, and its rollouts.
+
+    Raises:
+        ValueError: policies with different tokens, which would need a log each.
+    """
     decoding, told = build(Decoding, cfg.decoding, "decoding"), {"decoding": plain(cfg.decoding)}
     policies = {name: open_policy(path, cfg.device) for name, path in policies_of(cfg).items()}
-    several = len(policies) > 1
-    yield "log", {}, lambda scenes: logs(scenes, None)
-    first, _, config = next(iter(policies.values()))
-    yield "log through tokens", {"tokenizer": config["tokenizer"]}, lambda scenes: logs(scenes, first.tokenizer)
+    model, options, first = next(iter(policies.values()))
+    for name, (_, _, config) in policies.items():
+        if differ := differences(config["tokenizer"], first["tokenizer"]):
+            raise ValueError(f"{name} has other tokens than the first policy ({differ}); ask for it alone.")
+    cut, tokenizer, several = options, on_cpu(model.tokenizer), len(policies) > 1
+    yield "log", {}, lambda scenes: logs(scenes, cut, None)
+    yield "log through tokens", {"tokenizer": first["tokenizer"]}, lambda scenes: logs(scenes, cut, tokenizer)
     for name, (model, options, config) in policies.items():
         own = told | {"policy": weights_digest(model), **config}
         alone, among = replace(options, control="sdc"), replace(options, control="all")
@@ -125,11 +142,12 @@ def look(scene: Scene, trajectories: Tensor, metric: RealismConfig) -> dict[str,
         metric: whose measurements these are.
 
     Returns:
-        ``collision``, ``off-road`` and ``away`` (from the log [m]), each ``at`` some seconds.
+        ``collision``, ``off-road`` and ``away`` (from the log [m]), each by some seconds; NaN where its log has ended.
 
     Raises:
         ValueError: the scene has no self-driving car.
     """
+    scene, trajectories = _to_the_end(scene, trajectories)
     comparison = compare(scene, trajectories, metric)
     measured, agents = measure([comparison], metric)[0], scene.agents
     row = torch.isin(measured.track_id, agents.track_id[agents.sdc]).nonzero()
@@ -137,15 +155,24 @@ def look(scene: Scene, trajectories: Tensor, metric: RealismConfig) -> dict[str,
         raise ValueError(f"scene {scene.scene_id} has no self-driving car; leave it out.")
     row, there = int(row), measured.scored[int(row)]
     logged = comparison.scene.agents.position[row, -len(there) :, :2]
-    away = (comparison.simulated[:, row, :, :2] - logged).norm(dim=-1)
-    found = {}
-    for name, event in (("collision", "collision_per_step"), ("off-road", "offroad_per_step")):
-        happened = (measured.values[event][1:, row] & there).float().cummax(-1).values.mean(0)
-        found |= {f"{name} {seconds:g} s": happened[_last(seconds)].item() for seconds in SECONDS}
-    for seconds in SECONDS:
-        known = there[_last(seconds)]
-        found[f"away {seconds:g} s [m]"] = away[:, _last(seconds)].mean().item() if known else float("nan")
-    return found
+    away = (comparison.simulated[:, row, :, :2] - logged).norm(dim=-1).mean(0)
+    happened = {
+        name: measured.values[event][1:, row].float().cummax(-1).values.mean(0)
+        for name, event in (("collision", "collision_per_step"), ("off-road", "offroad_per_step"))
+    }
+    found = happened | {"away [m]": away}
+    return {
+        f"{name} {seconds:g} s": found[name][_last(seconds)].item() if there[_last(seconds)] else float("nan")
+        for name in found
+        for seconds in SECONDS
+    }
+
+
+def _to_the_end(scene: Scene, trajectories: Tensor) -> tuple[Scene, Tensor]:
+    """The scene and its rollouts with the self-driving car, and of the others those whose log goes on to the end."""
+    agents = scene.agents
+    stays = agents.sdc | agents.valid[:, -1]
+    return select_agents(scene, agents.present & stays), trajectories[:, stays[agents.present]]
 
 
 def _last(seconds: float) -> int:

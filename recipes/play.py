@@ -28,6 +28,7 @@ from dpa.report.page import write_rollouts
 from dpa.report.player import PlayerScene
 from dpa.rollout import make_collector
 from envs import keys
+from envs.render import check_writable
 from envs.store import SceneStore
 from recipes.common.cli import CONFIG, build, recipe
 from recipes.common.models import open_policy, policies_of
@@ -144,6 +145,7 @@ def main(cfg: DictConfig) -> None:
     if Path(cfg.output).suffix not in (".html", *DRAWN):
         known = ", ".join((".html", *DRAWN))
         raise ValueError(f"output={cfg.output} is no page, picture or film; name a file that ends in one of {known}.")
+    check_writable(cfg.output)
     policies = policies_of(cfg)
     scenes = open_splits(cfg.scenes)[cfg.split]
     players = roll_out(
@@ -159,7 +161,7 @@ def main(cfg: DictConfig) -> None:
     )
     if draw := DRAWN.get(Path(cfg.output).suffix):
         draw(players, cfg.output)
-        print(f"picture: {cfg.output}")
+        print(f"{'film' if draw is film_likely else 'picture'}: {cfg.output}")
         return
     facts = {name: str(path) for name, path in policies.items()} | {
         "decoding": f"top-p {cfg.decoding.top_p:g}, temperature {cfg.decoding.temperature:g}, seed {cfg.seed}",

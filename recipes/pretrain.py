@@ -106,7 +106,7 @@ def pretrain(
     loss = NextTokenLoss(token_network(model), label_smoothing=options.label_smoothing)
     loss.set_keys(labels=keys.LABELS)
     loss = ranks.wrap(loss)
-    optimizer = make_optimizer(model, options.lr, options.weight_decay, kind=options.optimizer)
+    optimizer = make_optimizer(model, options.lr, options.weight_decay, kind=options.optimizer, rms=options.rms)
     schedule = make_schedule(optimizer, options.steps, options.warmup)
     run = Run(
         folder,

@@ -14,11 +14,12 @@ from envs.geometry.frames import to_local, to_world
 
 
 class ClosestActor(MotionActor):
-    """Takes, of its K most probable tokens, the one that ends nearest to the log, and says which token would be best.
+    """Follows a target by its own K most probable tokens, and says which token of all would be best.
 
     So it visits states that it drives into by itself, and never strays far from where the log still has an answer
-    (closest among top-K, Zhang et al., CVPR 2025, section 4). The best token is what the tokenizer makes of the motion
-    to the target; where it is none of the K, the one whose box ends nearest, by the mean distance of corners, is taken.
+    (closest among top-K, Zhang et al., CVPR 2025, section 4). The best token, the label, is what the tokenizer makes of
+    the motion to the target. It is taken where it is one of the K; elsewhere the one of them whose box ends nearest, by
+    the mean distance of corners.
     Where the log has no pose at the end of a decision, the most probable token is taken, and there is no label.
 
     The paper's target is the log. Tokens that change a velocity must undo at once what they do to be back there, so
@@ -86,13 +87,12 @@ class ClosestActor(MotionActor):
         """``[B, A, F, 3]``: where to be, in the agents' own frames; ``[B, A]``: the log knows the decision's end."""
         steps, rows = self.model.tokenizer.steps, torch.arange(len(step), device=step.device) // self.num_rollouts
         decisions = (each.unflatten(2, (-1, steps)) for each in (self._context.logged, self._context.logged_valid))
-        logged, valid = (each[rows] for each in decisions)  # [B, A, T, F, ...]
-        each = torch.arange(len(step), device=step.device)
-        poses, current, before = logged[each, :, step], recent[..., -1, :], (step - 1).clamp(min=0)
+        (logged, valid), before = decisions, (step - 1).clamp(min=0)  # [S, A, T, F, ...]
+        poses, current = logged[rows, :, step], recent[..., -1, :]
         # Nothing is left of the offset where the log had no pose to be beside, nor before the first decision.
-        beside = valid[each, :, before, -1] & (step > 0)[:, None]
-        left = (1 - self.recovery) * to_local(current, logged[each, :, before, -1]) * beside[..., None]
-        return to_local(to_world(left[..., None, :], poses), current[..., None, :]), valid[each, :, step, -1]
+        beside = valid[rows, :, before, -1] & (step > 0)[:, None]
+        left = (1 - self.recovery) * to_local(current, logged[rows, :, before, -1]) * beside[..., None]
+        return to_local(to_world(left[..., None, :], poses), current[..., None, :]), valid[rows, :, step, -1]
 
     def _apart(self, tokens: Tensor, target: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
         """``[B, A, K]``: mean distance of the box's corners at the ends of tokens from those at the target [m]."""

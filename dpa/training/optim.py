@@ -13,7 +13,7 @@ from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from dpa.training.distributed import ALONE, Ranks, without_sync
-from dpa.training.muon import Muon
+from dpa.training.muon import RMS, Muon
 
 T = TypeVar("T")
 OPTIMIZERS = ("adamw", "muon")
@@ -30,6 +30,7 @@ def make_optimizer(
     weight_decay: float,
     betas: tuple[float, float] = BETAS,
     kind: Literal["adamw", "muon"] = "adamw",
+    rms: float = RMS,
 ) -> AdamW:
     """An optimiser whose weight decay spares norms, biases and embeddings.
 
@@ -42,7 +43,9 @@ def make_optimizer(
         lr: peak learning rate.
         weight_decay: decay of the matrices.
         betas: decay rates of the first and second moment.
-        kind: ``adamw``, or ``muon`` for the matrices and AdamW for the rest.
+        kind: ``adamw``, or ``muon`` for the matrices and AdamW for the rest. Keys and values in one matrix, and the
+            output layer, which others leave to AdamW, are matrices like all.
+        rms: of Muon's steps, see :data:`~dpa.training.muon.RMS`.
 
     Raises:
         ValueError: no parameter of ``module`` needs a gradient, or an unknown kind.
@@ -68,7 +71,7 @@ def make_optimizer(
     wide = [each for each in decayed if each.ndim == 2 and min(each.shape) >= MUON_SIDE]
     thin = [each for each in decayed if each.ndim != 2 or min(each.shape) < MUON_SIDE]
     rest = _group(thin, weight_decay, orthogonal=False) + _group(spared, 0.0, orthogonal=False)
-    return Muon(_group(wide, weight_decay, orthogonal=True) + rest, lr=lr, betas=betas)
+    return Muon(_group(wide, weight_decay, orthogonal=True, rms=rms) + rest, lr=lr, betas=betas)
 
 
 def _group(parameters: list[nn.Parameter], weight_decay: float, **more: Any) -> list[dict[str, Any]]:

@@ -10,11 +10,12 @@ once and then only what moves. From a shell::
 
 from envs.render.layers import View, box_corners, draw_agents, draw_map, draw_trails, fit_view, frame_view, pose_tracks
 from envs.render.picture import draw_scene, render_frame, render_frames
-from envs.render.save import save_picture
+from envs.render.save import check_writable, save_picture
 
 __all__ = [
     "View",
     "box_corners",
+    "check_writable",
     "draw_agents",
     "draw_map",
     "draw_scene",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from itertools import chain
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 from matplotlib.colors import to_rgb
@@ -65,14 +66,28 @@ def _write_gif(part: Path, frames: Iterable[Frame], frame_seconds: float) -> Non
     still[0].save(part, format="GIF", save_all=True, append_images=still[1:], duration=duration, loop=0)
 
 
-def _write_mp4(part: Path, frames: Iterable[Frame], frame_seconds: float) -> None:
+def check_writable(path: str | Path) -> None:
+    """Refuse a picture that could not be written, before it is made.
+
+    Raises:
+        ImportError: an MP4 without the extra ``video``.
+    """
+    if Path(path).suffix.lower() == ".mp4":
+        _ffmpeg()
+
+
+def _ffmpeg() -> ModuleType:
     try:
         import imageio_ffmpeg
     except ImportError as error:
         raise ImportError(
             "an MP4 needs the extra `video`: pip install 'dpa-omf[video]'; a .gif needs nothing"
         ) from error
-    writer = None
+    return imageio_ffmpeg
+
+
+def _write_mp4(part: Path, frames: Iterable[Frame], frame_seconds: float) -> None:
+    imageio_ffmpeg, writer = _ffmpeg(), None
     for frame in frames:
         height, width = (side - side % 2 for side in frame.shape[:2])  # the codec takes even sides only
         if writer is None:

@@ -51,7 +51,7 @@ LIMITS: dict[str, Limit] = {
         ("aligned_scenes", "scenes.limit", "select.max_agents", "submission_shards"), COUNT._replace(empty=True)
     ),
     **dict.fromkeys(("seed", "split_seed"), Limit(int)),
-    **dict.fromkeys(("memory", "max_norm", "lr", "length", "piece_length", "temperature", "top_p"), POSITIVE),
+    **dict.fromkeys(("memory", "max_norm", "lr", "rms", "length", "piece_length", "temperature", "top_p"), POSITIVE),
     **dict.fromkeys(("noise", "dropout", "mirror", "agent_drop", "label_smoothing"), SHARE),
     **dict.fromkeys(("weight_decay", "rotation", "keep_gib"), Limit(float, least=0)),
     **dict.fromkeys(("loss.alpha", "loss.cloning", "loss.conservative", "margin"), Limit(float)),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from math import isnan
 from pathlib import Path
 
 import pytest
@@ -59,19 +60,28 @@ def test_a_car_that_catches_up_collides_by_the_time_that_it_does() -> None:
     faster[1, 0, :, 0] += 0.5 * torch.arange(1, 81)
     found = look(scene, faster, METRIC)
     assert found["collision 2 s"] == 0.0 and found["collision 8 s"] == 0.5, "in one of two rollouts"
-    assert found["away 2 s [m]"] == pytest.approx(5.0) and found["away 8 s [m]"] == pytest.approx(20.0), (
+    assert found["away [m] 2 s"] == pytest.approx(5.0) and found["away [m] 8 s"] == pytest.approx(20.0), (
         "means over both"
     )
 
 
-def test_of_a_log_that_has_ended_no_distance_is_known_and_nothing_happens_afterwards() -> None:
+def test_of_a_log_that_has_ended_nothing_is_known() -> None:
     scene = two_cars()
     faster = logged(scene)[None].clone()
     faster[:, 0, :, 0] += 0.5 * torch.arange(1, 81)
     scene.agents.valid[0, CURRENT_STEP + 31 :] = False
     found = look(scene, faster, METRIC)
-    assert found["away 8 s [m]"] != found["away 8 s [m]"], "not a number"
-    assert found["collision 8 s"] == 0.0 and found["away 2 s [m]"] == pytest.approx(10.0)
+    assert found["away [m] 2 s"] == pytest.approx(10.0) and found["collision 2 s"] == 0.0
+    assert all(isnan(found[f"{name} 8 s"]) for name in ("collision", "off-road", "away [m]"))
+
+
+def test_nobody_runs_into_an_agent_whose_log_has_ended() -> None:
+    """The front car leaves after three seconds, 60 m on; the other one, as logged, drives through where it was last."""
+    scene = two_cars()
+    log = logged(scene)[None].clone()
+    scene.agents.valid[1, CURRENT_STEP + 31 :] = False
+    log[:, 1, 30:, 0] = log[:, 1, 30:31, 0]
+    assert look(scene, log, METRIC)["collision 8 s"] == 0.0
 
 
 def test_a_scene_without_a_self_driving_car_is_refused() -> None:
@@ -83,10 +93,10 @@ def test_a_scene_without_a_self_driving_car_is_refused() -> None:
 
 def rows(scene: Scene, model: type[MotionLM]) -> tuple[Tensor, Tensor, Tensor]:
     """``[A, 80, 4]`` of the log, of the log through tokens, and of single decisions."""
-    tokenizer = VerletTokenizer()
+    tokenizer, cut = VerletTokenizer(), ContextOptions()
     options = OmegaConf.create({"num_rollouts": 1, "seed": 0, "device": "cpu"})
-    decided = single_decisions([scene], model("nano", tokenizer), ContextOptions(), Decoding(), options)
-    return tuple(next(rolls)[1][0] for rolls in (logs([scene], None), logs([scene], tokenizer), decided))
+    decided = single_decisions([scene], model("nano", tokenizer), cut, Decoding(), options)
+    return tuple(next(rolls)[1][0] for rolls in (logs([scene], cut, None), logs([scene], cut, tokenizer), decided))
 
 
 def test_single_decisions_of_who_knows_the_log_are_the_log_through_tokens() -> None:
@@ -123,11 +133,23 @@ def test_the_recipe_tells_all_rows_with_intervals_and_reads_them_back(
     assert outcome.status == 0, outcome.err
     content = json.loads(out.read_text())
     assert list(content["rows"]) == ["log", "log through tokens", "single decisions", "alone", "among its own"]
-    away = {name: sum(row["away 8 s [m]"]) for name, row in content["rows"].items()}
+    away = {name: sum(row["away [m] 8 s"]) for name, row in content["rows"].items()}
     assert away["log"] == 0.0 < away["log through tokens"] < away["single decisions"] < away["alone"]
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "gap").glob("*_*.json")}
     assert "single decisions" in run("gap", *options("gap", f"policies={policies[0]}", *small)).out
     assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "gap").glob("*_*.json")}
+
+
+def test_policies_with_different_tokens_are_refused(
+    run: Callable, options: Callable, policies: list[Path], tmp_path: Path
+) -> None:
+    with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):
+        linear = policy_config(compose("pretrain", ["model=nano", "model.tokenizer.interpolation=linear"]).model)
+    (tmp_path / "linear").mkdir()
+    write_policy(tmp_path / "linear/policy.pt", build_policy(linear), linear, {})
+    both = f"policies=[{policies[0]},{tmp_path / 'linear/policy.pt'}]"
+    outcome = run("gap", *options("gap", both, f"output={tmp_path / 'gap'}"))
+    assert outcome.status == 2 and "linear has other tokens than the first policy" in outcome.err
 
 
 def test_rows_of_several_policies_are_named_by_them(

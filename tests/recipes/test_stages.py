@@ -8,6 +8,7 @@ import json
 import os
 import re
 import shutil
+import sys
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -1085,11 +1086,23 @@ def test_rollouts_of_some_policies_make_a_page_that_plays(
     assert '"reference"' in text and '"other"' in text and "top-p 0.95" in text
 
 
-def test_the_most_likely_rollouts_make_a_picture(run: Callable, options: Callable, runs: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("ending", "told"), [("png", "picture"), ("gif", "film")])
+def test_the_most_likely_rollouts_make_a_picture_or_a_film(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path, ending: str, told: str
+) -> None:
     command = options("play", f"policies={runs / 'reference/policy.pt'}", "show=[1]", "num_rollouts=2")
-    outcome = run("play", *command, f"output={tmp_path / 'likely.png'}")
+    outcome = run("play", *command, f"output={tmp_path / 'likely'}.{ending}")
     assert outcome.status == 0, outcome.err
-    assert (tmp_path / "likely.png").stat().st_size > 10_000
+    assert f"{told}: " in outcome.out and (tmp_path / f"likely.{ending}").stat().st_size > 10_000
+
+
+def test_a_film_that_could_not_be_written_is_refused_before_any_rollout(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setattr("recipes.play.roll_out", None)
+    outcome = run("play", *options("play", f"policies={runs / 'reference/policy.pt'}", f"output={tmp_path / 'a.mp4'}"))
+    assert outcome.status == 2 and "an MP4 needs the extra `video`" in outcome.err
 
 
 def test_a_page_to_play_needs_the_name_of_one(run: Callable, options: Callable, runs: Path, tmp_path: Path) -> None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from dpa.policy import MotionLM, make_context
+from dpa.policy import MotionLM, SceneContext, make_context
 from dpa.policy.actor import Contexts
 from dpa.policy.closest import ClosestActor
 from dpa.tokens import TokenAction, VerletTokenizer
@@ -15,7 +16,7 @@ from dpa.training.logs import log_item
 from envs import keys
 from envs.geometry.boxes import box_corners
 from envs.geometry.frames import to_local, to_world
-from envs.scene import Scene
+from envs.scene import CURRENT_STEP, Scene
 from envs.sources.synthetic import build_scene, straight_road
 from envs.traffic import TrafficEnv
 
@@ -53,23 +54,46 @@ def test_of_one_candidate_the_most_probable_is_taken_and_the_label_still_leads_b
     assert (rolled[keys.TOKEN] != rolled[keys.LABEL]).any()
 
 
-def test_the_taken_token_ends_nearest_to_the_log_among_the_likely_ones() -> None:
-    """By hand, for the first decision: every candidate is driven, and its box set against that of the log."""
-    scene, context = straight_road(3, seed=5), make_context(straight_road(3, seed=5))
-    rolled = followed([scene], candidates=20)
-    env = TransformedEnv(TrafficEnv([scene]), TokenAction(TOKENIZER))
-    actor = ClosestActor(policy(), Contexts([scene]), candidates=20)
-    likely = actor.logits(env.reset()).topk(20).indices[0]
-    for agent in range(3):
-        apart = []
-        for token in likely[agent]:
-            end = TOKENIZER.advance(token[None], context.recent[agent][None], context.kind[agent][None])[0, -1]
-            boxes = (torch.cat((pose, context.extent[agent, :2])) for pose in (end, context.logged[agent, 4]))
-            mine, logs = (box_corners(box) for box in boxes)
-            apart.append((mine - logs).norm(dim=-1).mean())
-        label = rolled[keys.LABEL][0, 0, agent]
-        nearest = label if label in likely[agent] else likely[agent][torch.stack(apart).argmin()]
-        assert rolled[keys.TOKEN][0, 0, agent] == nearest
+def apart(context: SceneContext, agent: int, tokens: Tensor) -> Tensor:
+    """How far the box of an agent ends from that of the log after its first decision, by hand: ``[n]``."""
+    found = []
+    for token in tokens:
+        end = TOKENIZER.advance(token[None], context.recent[agent][None], context.kind[agent][None])[0, -1]
+        boxes = (torch.cat((pose, context.extent[agent, :2])) for pose in (end, context.logged[agent, 4]))
+        mine, logs = (box_corners(box) for box in boxes)
+        found.append((mine - logs).norm(dim=-1).mean())
+    return torch.stack(found)
+
+
+def test_the_label_is_taken_where_it_is_likely_and_otherwise_the_likely_token_that_ends_nearest() -> None:
+    inside = outside = 0
+    for seed, candidates in ((0, 20), (1, 20), (0, 120), (1, 120)):
+        scene = straight_road(3, seed=seed)
+        rolled, context = followed([scene], candidates=candidates), make_context(scene)
+        env = TransformedEnv(TrafficEnv([scene]), TokenAction(TOKENIZER))
+        logits = ClosestActor(policy(), Contexts([scene])).logits(env.reset())
+        likely = logits.topk(candidates).indices[0]
+        for agent in range(3):
+            token, label = (rolled[key][0, 0, agent] for key in (keys.TOKEN, keys.LABEL))
+            if label in likely[agent]:
+                assert token == label
+                inside += 1
+            else:
+                assert token == likely[agent][apart(context, agent, likely[agent]).argmin()]
+                outside += 1
+    assert inside and outside, "the scenes have both"
+
+
+def test_a_likely_label_is_taken_though_the_box_of_another_token_ends_nearer() -> None:
+    """The tokenizer goes by where the centre ends; the corners of a turning car may say otherwise."""
+    scene, context = straight_road(1, seed=0), make_context(straight_road(1, seed=0))
+    context.logged[0, 4, 2] += 0.8  # of the log's last pose, the heading alone
+    distances = apart(context, 0, torch.arange(169))
+    target = to_local(context.logged[:, :5], context.recent[:, -1:])
+    label = TOKENIZER.encode(target, context.recent, context.kind)[0]
+    assert distances.argmin() != label, "the case that is meant"
+    scene.agents.heading[0, CURRENT_STEP + 5] += 0.8
+    assert followed([scene], candidates=169)[keys.TOKEN][0, 0, 0] == label
 
 
 def test_slow_recovery_aims_at_the_log_moved_by_what_is_left_of_the_offset() -> None:

@@ -70,6 +70,32 @@ def test_the_first_step_of_a_matrix_by_hand() -> None:
     assert 0.6 * 0.01 * 0.6 < size < 1.2 * 0.01 * 0.6
 
 
+@pytest.mark.parametrize("shape", [(32, 48), (64, 40)])
+def test_matrices_move_as_those_of_pytorchs_own_muon(shape: tuple[int, int]) -> None:
+    """Which iterates in bfloat16, so within a few per cent of a step; at its size of step, and over several of them."""
+    torch.manual_seed(0)
+    ours, theirs = (nn.Parameter(value) for value in torch.randn(shape).expand(2, *shape).clone())
+    optimizers = (
+        Muon([{"params": [ours], "weight_decay": 0.1, "orthogonal": True, "rms": 0.2}], lr=0.01, betas=(0.9, 0.95)),
+        torch.optim.Muon([theirs], lr=0.01, weight_decay=0.1, adjust_lr_fn="match_rms_adamw"),
+    )
+    start = ours.detach().clone()
+    for _ in range(4):
+        gradient = torch.randn(shape)
+        for weight, optimizer in zip((ours, theirs), optimizers, strict=True):
+            weight.grad = gradient.clone()
+            optimizer.step()
+    moved = (ours - start).norm()
+    assert (ours - theirs).norm() < 0.03 * moved
+
+
+def test_a_run_that_goes_on_keeps_the_size_of_step_that_it_began_with() -> None:
+    begun = make_optimizer(Net(), 0.01, 0.1, kind="muon", rms=0.2)
+    resumed = make_optimizer(Net(), 0.01, 0.1, kind="muon")
+    resumed.load_state_dict(begun.state_dict())
+    assert resumed.param_groups[0]["rms"] == 0.2
+
+
 def test_what_is_no_wide_matrix_moves_as_adamw_moves_it() -> None:
     torch.manual_seed(0)
     net = Net()
