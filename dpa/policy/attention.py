@@ -139,19 +139,16 @@ class RelativeAttention(nn.Module):
         return tuple(x.float().unflatten(-1, (parts, self.heads, self.dim)).permute(2, 0, 3, 1, 4))
 
     def _blocks(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Vectors ``[..., blocks]`` as complex numbers, their weights, and the channels without geometry."""
+        """Vectors ``[..., blocks, 2]``, their weights ``[..., blocks]``, and the channels without geometry."""
         vector, weight, rest = x.split((2 * self.blocks, self.blocks, self.dim - 3 * self.blocks), -1)
-        return torch.view_as_complex(vector.unflatten(-1, (self.blocks, 2))), weight, rest
-
-    @staticmethod
-    def _join(vector: Tensor, *channels: Tensor) -> Tensor:
-        return torch.cat((torch.view_as_real(vector).flatten(-2), *channels), -1)
+        return vector.unflatten(-1, (self.blocks, 2)), weight, rest
 
     def _move(self, x: Tensor, pose: Tensor, more: Tensor) -> Tensor:
         """Multiply by rho(g): turn the vectors and shift them by weight times position; then ``more`` channels."""
         vector, weight, rest = self._blocks(x)
         turn, place = _turn_and_place(pose)
-        return self._join(vector * turn + weight * place, weight, rest, more)
+        vector = turned(vector, turn) + weight[..., None] * place
+        return torch.cat((vector.flatten(-2), weight, rest, more), -1)
 
     def _query(self, x: Tensor, pose: Tensor, more: Tensor) -> Tensor:
         """Multiply by rho(g)^-T, scaled as in dot-product attention, so that q . k = x^T rho(g_i^-1 g_j) key.
@@ -160,14 +157,15 @@ class RelativeAttention(nn.Module):
         """
         vector, weight, rest = self._blocks(x * self.dim**-0.5)
         turn, place = _turn_and_place(pose)
-        vector = vector * turn
-        return self._join(vector, weight - (vector * place.conj()).real, rest, more)
+        vector = turned(vector, turn)
+        return torch.cat((vector.flatten(-2), weight - (vector * place).sum(-1), rest, more), -1)
 
     def _back(self, x: Tensor, pose: Tensor) -> Tensor:
         """Multiply by rho(g)^-1: what was seen, in the frame of the query."""
         vector, weight, rest = self._blocks(x)
         turn, place = _turn_and_place(pose)
-        return self._join((vector - weight * place) * turn.conj(), weight, rest)
+        vector = turned(vector - weight[..., None] * place, turn * turn.new_tensor((1.0, -1.0)))
+        return torch.cat((vector.flatten(-2), weight, rest), -1)
 
     def _gaze(self, x: Tensor, pose: Tensor) -> Tensor:
         """``[B, H, m, GAZE]``: w * (c_x, c_y, 1, 0) for a centre c in the scene's frame, in units of METRES."""
@@ -178,12 +176,23 @@ class RelativeAttention(nn.Module):
 
 
 def _turn_and_place(pose: Tensor) -> tuple[Tensor, Tensor]:
-    """Poses ``[..., n, 3]`` as complex numbers ``[..., n, 1]``: what turns by the heading, and the position.
+    """Of poses ``[..., n, 3]``: cosine and sine of the heading, and the position in METRES, ``[..., n, 1, 2]`` each."""
+    heading = pose[..., None, 2]
+    return torch.stack((heading.cos(), heading.sin()), -1), pose[..., None, :2] / METRES
 
-    One complex product is a fraction of the work of a rotation written out in real numbers.
+
+def turned(vector: Tensor, turn: Tensor) -> Tensor:
+    """Turn vectors ``[..., 2]`` by angles of which ``turn`` has cosine and sine.
+
+    Examples:
+        >>> turned(torch.tensor([[3.0, 4.0]]), torch.tensor([[0.0, 1.0]]))
+        tensor([[-4.,  3.]])
     """
-    heading = pose[..., 2:]
-    return torch.complex(heading.cos(), heading.sin()), torch.complex(pose[..., :1], pose[..., 1:2]) / METRES
+    if torch.compiler.is_compiling():  # inductor fuses what is written out, and knows no complex numbers
+        (x, y), (cos, sin) = vector.unbind(-1), turn.unbind(-1)
+        return torch.stack((x * cos - y * sin, x * sin + y * cos), -1)
+    # One product of complex numbers is a fraction of that work.
+    return torch.view_as_real(torch.view_as_complex(vector) * torch.view_as_complex(turn))
 
 
 class NodeAttention(RelativeAttention):

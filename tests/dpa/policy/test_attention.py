@@ -33,9 +33,7 @@ def tokens(num: int, seed: int = 0, width: int = WIDTH) -> tuple[Tensor, Tensor]
 
 def seen_from(attention: RelativeAttention, channels: Tensor, relative: Tensor) -> Tensor:
     """``[H, D]`` channels of one token as they appear from another one: vectors turned and shifted."""
-    blocks = attention.blocks
-    vector, weight, rest = channels.split((2 * blocks, blocks, attention.dim - 3 * blocks), -1)
-    vector = vector.unflatten(-1, (blocks, 2))
+    vector, weight, rest = attention._blocks(channels)
     angle = relative[2].expand(vector.shape[:-1])
     vector = rotate(vector, angle) + weight[..., None] * relative[:2] / METRES
     return torch.cat((vector.flatten(-2), weight, rest), -1)
