@@ -272,7 +272,8 @@ def test_readme_and_architecture_show_the_same_flow() -> None:
 def test_pictures_of_the_documents_are_small() -> None:
     pictures = sorted((REPOSITORY / "docs" / "images").iterdir())
     assert pictures
-    assert not [picture.name for picture in pictures if picture.stat().st_size > 150_000]
+    largest = {".gif": 250_000}  # of a film; of a picture:
+    assert not [each.name for each in pictures if each.stat().st_size > largest.get(each.suffix, 150_000)]
 
 
 SPLITS = ("train", "tune", "eval")
