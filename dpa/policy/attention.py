@@ -99,9 +99,11 @@ class RelativeAttention(nn.Module):
         """Keys and values of tokens ``x`` ``[B, n, width]`` at ``pose`` ``[B, n, 3]``."""
         key, value = self._split(self.key_value(x), 2)
         pose = pose[:, None]
+        turn, place = _turn(pose[..., 2]), _place(pose)
         xy = (pose[..., :2] / METRES).expand(*key.shape[:-1], 2)
         window = torch.cat((xy, -(xy[..., :1] ** 2 + xy[..., 1:] ** 2) / 2, torch.zeros_like(xy[..., :1])), -1)
-        return KeyValues(self._move(key, pose, window), self._move(value, pose, torch.zeros_like(window)))
+        still = torch.zeros_like(window)
+        return KeyValues(self._move(key, turn, place, window), self._move(value, turn, place, still))
 
     def forward(self, x: Tensor, pose: Tensor, memory: KeyValues, mask: Tensor | None = None) -> Tensor:
         """Attend from tokens to remembered ones.
@@ -143,10 +145,9 @@ class RelativeAttention(nn.Module):
         vector, weight, rest = x.split((2 * self.blocks, self.blocks, self.dim - 3 * self.blocks), -1)
         return vector.unflatten(-1, (self.blocks, 2)), weight, rest
 
-    def _move(self, x: Tensor, pose: Tensor, more: Tensor) -> Tensor:
+    def _move(self, x: Tensor, turn: Tensor, place: Tensor, more: Tensor) -> Tensor:
         """Multiply by rho(g): turn the vectors and shift them by weight times position; then ``more`` channels."""
         vector, weight, rest = self._blocks(x)
-        turn, place = _turn_and_place(pose)
         vector = turned(vector, turn) + weight[..., None] * place
         return torch.cat((vector.flatten(-2), weight, rest, more), -1)
 
@@ -156,15 +157,13 @@ class RelativeAttention(nn.Module):
         ``more`` channels follow.
         """
         vector, weight, rest = self._blocks(x * self.dim**-0.5)
-        turn, place = _turn_and_place(pose)
-        vector = turned(vector, turn)
-        return torch.cat((vector.flatten(-2), weight - (vector * place).sum(-1), rest, more), -1)
+        vector = turned(vector, _turn(pose[..., 2]))
+        return torch.cat((vector.flatten(-2), weight - (vector * _place(pose)).sum(-1), rest, more), -1)
 
     def _back(self, x: Tensor, pose: Tensor) -> Tensor:
         """Multiply by rho(g)^-1: what was seen, in the frame of the query."""
         vector, weight, rest = self._blocks(x)
-        turn, place = _turn_and_place(pose)
-        vector = turned(vector - weight[..., None] * place, turn * turn.new_tensor((1.0, -1.0)))
+        vector = turned(vector - weight[..., None] * _place(pose), _turn(-pose[..., 2]))
         return torch.cat((vector.flatten(-2), weight, rest), -1)
 
     def _gaze(self, x: Tensor, pose: Tensor) -> Tensor:
@@ -175,10 +174,14 @@ class RelativeAttention(nn.Module):
         return torch.cat((precision * centre, precision, torch.zeros_like(precision)), -1)
 
 
-def _turn_and_place(pose: Tensor) -> tuple[Tensor, Tensor]:
-    """Of poses ``[..., n, 3]``: cosine and sine of the heading, and the position in METRES, ``[..., n, 1, 2]`` each."""
-    heading = pose[..., None, 2]
-    return torch.stack((heading.cos(), heading.sin()), -1), pose[..., None, :2] / METRES
+def _turn(angle: Tensor) -> Tensor:
+    """Cosine and sine of angles ``[..., n]``, as ``[..., n, 1, 2]``."""
+    return torch.stack((angle.cos(), angle.sin()), -1)[..., None, :]
+
+
+def _place(pose: Tensor) -> Tensor:
+    """Positions of poses ``[..., n, 3]`` in METRES, as ``[..., n, 1, 2]``."""
+    return pose[..., None, :2] / METRES
 
 
 def turned(vector: Tensor, turn: Tensor) -> Tensor:
