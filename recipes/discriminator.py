@@ -9,7 +9,6 @@ again to go on after a kill.
 
 from __future__ import annotations
 
-import copy
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -84,7 +83,7 @@ def trained(cfg: DictConfig, scenes: SceneStore, policy: Path, name: str) -> tup
     rolled_by = {key: decided_by[key] for key in ("policy", "scenes", "sight", "decoding", "seed")}
     shelf = MotionShelf(folder / "motions", rolled_by | {"num_rollouts": cfg.training.num_rollouts})
     there = frozenset(shelf.scenes())
-    see = partial(seen, sight=sight, tokenizer=copy.deepcopy(model.tokenizer).cpu(), options=context)
+    see = partial(seen, sight=sight, tokenizer=model.tokenizer.on_cpu(), options=context)
     for each in rolled_out(cfg, scenes, model, context, cfg.training.num_rollouts, there, f"{name} rollouts"):
         shelf.put(each.index, see(each)[0])
     net, curve = fit(cfg.training, shape, shelf, folder, seed=cfg.seed, decided_by=decided_by, logger=cfg.logger)

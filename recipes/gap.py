@@ -13,7 +13,6 @@ Run the same command again to go on after a kill: rows that are there are read b
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -31,7 +30,7 @@ from dpa.realism import RealismConfig
 from dpa.realism.features import measure
 from dpa.realism.tracks import compare
 from dpa.report.statistics import summary
-from dpa.rollout import lifted, make_collector
+from dpa.rollout import lifted
 from dpa.tokens import MotionTokenizer
 from envs.files import write_json
 from envs.geometry.frames import to_world
@@ -41,7 +40,7 @@ from envs.scene import STEP_SECONDS, Scene, SceneSource, select_agents
 from envs.seeding import make_generator
 from recipes.common.cli import CONFIG, build, finished, plain, recipe
 from recipes.common.models import open_policy, policies_of, weights_digest
-from recipes.common.rolled import rolled
+from recipes.common.rolled import driven
 from recipes.common.scenes import fingerprint, open_splits
 from recipes.studies.tables import StudyTable, tell
 
@@ -67,7 +66,7 @@ def single_decisions(
     scenes: SceneSource, model: MotionLM, options: ContextOptions, decoding: Decoding, cfg: DictConfig
 ) -> Rolls:
     """Every decision of the self-driving car taken from where the log, through its tokens, has brought it."""
-    options, tokenizer = replace(options, control="sdc"), on_cpu(model.tokenizer)
+    options, tokenizer = replace(options, control="sdc"), model.tokenizer.on_cpu()
     for index in range(len(scenes)):
         scene = scenes[index]
         context = make_context(scene, options)
@@ -87,26 +86,6 @@ def single_decisions(
         yield index, lifted(scene, torch.where(context.controlled[:, None, None], moved, context.logged))
 
 
-def on_cpu(tokenizer: MotionTokenizer) -> MotionTokenizer:
-    """A tokenizer beside the one of a model that may be elsewhere: scenes are cut up on the CPU."""
-    return copy.deepcopy(tokenizer).cpu()
-
-
-def driven(scenes: SceneSource, model: MotionLM, options: ContextOptions, decoding: Decoding, cfg: DictConfig) -> Rolls:
-    """Rollouts of every scene by the policy, as ``options.control`` says who is driven."""
-    batches = make_collector(
-        scenes,
-        model,
-        num_rollouts=cfg.num_rollouts,
-        decoding=decoding,
-        options=options,
-        seed=cfg.seed,
-        memory=cfg.memory,
-        device=cfg.device,
-    )
-    return ((each.index, each.trajectories) for each in rolled(batches, scenes, cfg.num_rollouts))
-
-
 def rows(cfg: DictConfig) -> Iterator[tuple[str, dict[str, Any], Callable[[SceneSource], Rolls]]]:
     """Name of each row, what decides it, and its rollouts.
 
@@ -119,7 +98,7 @@ def rows(cfg: DictConfig) -> Iterator[tuple[str, dict[str, Any], Callable[[Scene
     for name, (_, _, config) in policies.items():
         if differ := differences(config["tokenizer"], first["tokenizer"]):
             raise ValueError(f"{name} has other tokens than the first policy ({differ}); ask for it alone.")
-    cut, tokenizer, several = options, on_cpu(model.tokenizer), len(policies) > 1
+    cut, tokenizer, several = options, model.tokenizer.on_cpu(), len(policies) > 1
     yield "log", {}, lambda scenes: logs(scenes, cut, None)
     yield "log through tokens", {"tokenizer": first["tokenizer"]}, lambda scenes: logs(scenes, cut, tokenizer)
     for name, (model, options, config) in policies.items():
@@ -127,8 +106,8 @@ def rows(cfg: DictConfig) -> Iterator[tuple[str, dict[str, Any], Callable[[Scene
         alone, among = replace(options, control="sdc"), replace(options, control="all")
         for row, roll in (
             ("single decisions", lambda s, m=model, o=options: single_decisions(s, m, o, decoding, cfg)),
-            ("alone", lambda s, m=model, o=alone: driven(s, m, o, decoding, cfg)),
-            ("among its own", lambda s, m=model, o=among: driven(s, m, o, decoding, cfg)),
+            ("alone", lambda s, m=model, o=alone: driven(s, m, o, cfg)),
+            ("among its own", lambda s, m=model, o=among: driven(s, m, o, cfg)),
         ):
             yield f"{name}: {row}" if several else row, own, roll
 

@@ -18,19 +18,18 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from dpa.policy import ContextOptions, Decoding, MotionLM
 from dpa.realism import RealismConfig, realism
 from dpa.report.statistics import summary
-from dpa.rollout import lifted, make_collector
+from dpa.rollout import lifted
 from dpa.tokens import MotionTokenizer
 from dpa.training.seeding import seed_everything
 from envs.files import write_json
 from envs.progress import progress
 from envs.scene import CURRENT_STEP, STEP_SECONDS, Scene, SceneSource
 from envs.seeding import make_generator
-from recipes.common.cli import CONFIG, build, finished, finite, plain, recipe
+from recipes.common.cli import CONFIG, finished, finite, plain, recipe
 from recipes.common.models import build_policy, context_options, open_policy, policies_of, policy_config, weights_digest
-from recipes.common.rolled import rolled
+from recipes.common.rolled import driven
 from recipes.common.scenes import fingerprint, open_splits
 from recipes.studies.tables import StudyTable, tell
 
@@ -119,24 +118,6 @@ def crude(scenes: SceneSource, rung: Rung, num_rollouts: int, seed: int) -> Iter
     """Rollouts of every scene by a rung that needs no model."""
     for index in range(len(scenes)):
         yield index, rung(scenes[index], num_rollouts, make_generator(seed, "ladder", index))
-
-
-def driven(
-    scenes: SceneSource, model: MotionLM, context: ContextOptions, cfg: DictConfig
-) -> Iterator[tuple[int, Tensor]]:
-    """Rollouts of every scene by a model."""
-    batches = make_collector(
-        scenes,
-        model,
-        num_rollouts=cfg.num_rollouts,
-        decoding=build(Decoding, cfg.decoding, "decoding"),
-        options=context,
-        seed=cfg.seed,
-        memory=cfg.memory,
-        device=cfg.device,
-    )
-    for each in rolled(batches, scenes, cfg.num_rollouts):
-        yield each.index, each.trajectories
 
 
 def rungs(cfg: DictConfig, scenes: SceneSource) -> Iterator[tuple[str, dict[str, Any], Iterator[tuple[int, Tensor]]]]:

@@ -218,7 +218,7 @@ def training_items(
     options = cfg.pretraining
     logs = LogItems(
         scenes,
-        copy.deepcopy(model.tokenizer).cpu(),
+        model.tokenizer.on_cpu(),
         context_options(cfg.model),
         augment=build(Augmentation, options.augmentation, "pretraining.augmentation"),
         noise=options.noise,
@@ -241,7 +241,7 @@ def training_items(
 def tuning_items(cfg: DictConfig, scenes: SceneSource, model: MotionLM, ranks: Ranks = ALONE) -> list[Item]:
     """This rank's part of the tokenized logs of a few scenes, always the same."""
     options = context_options(cfg.model)
-    logs = LogItems(scenes, copy.deepcopy(model.tokenizer).cpu(), options, max_agents=cfg.pretraining.max_agents)
+    logs = LogItems(scenes, model.tokenizer.on_cpu(), options, max_agents=cfg.pretraining.max_agents)
     bar = progress(ranks.mine(range(len(scenes))), "tokens", unit="scene", disable=not ranks.main)
     items = logs.collate([logs.prepare(index, make_generator(0, "tune", index)) for index in bar])
     if not ranks.sum(torch.tensor(sum(int(item.token_valid.sum()) for item in items))):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from abc import abstractmethod
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -127,6 +128,10 @@ class MotionTokenizer(nn.Module):
             recent = self.advance(token, recent, kind)
             tracks.append(recent[..., 1:, :])
         return torch.cat(tracks, -2)
+
+    def on_cpu(self) -> Self:
+        """A copy on the CPU, where logs are cut up and tokenized wherever the model is."""
+        return copy.deepcopy(self).cpu()
 
     def advance(self, token: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
         """``recent`` after one token: ``[*, F + 1, 3]``."""

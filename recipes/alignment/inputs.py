@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -109,7 +108,7 @@ class Inputs:
 
     def candidates(self, data: DictConfig, seed: int) -> Candidates:
         """See :func:`~recipes.alignment.candidates.make_candidates`."""
-        tokenizer = copy.deepcopy(self.model.tokenizer).cpu()  # logs are read on the CPU, wherever the model is
+        tokenizer = self.model.tokenizer.on_cpu()
         return make_candidates(data, self.store, self.scenes, self.context, tokenizer, seed, self.expert, self.learnt)
 
     def looks(self, data: DictConfig, alignment: DictConfig, watch: Watch | None) -> list[Look | ImitationLook]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Collection
 from itertools import islice
 from pathlib import Path
@@ -72,7 +71,7 @@ class Look:
             )
         rows = range(min(options.watch_scenes, len(store)))
         pairs = min(options.watch_pairs, store.provenance.num_rollouts // 2)
-        tokenizer = copy.deepcopy(model.tokenizer).cpu()  # logs are read on the CPU, wherever the model is
+        tokenizer = model.tokenizer.on_cpu()
         self.probes = list(make_probes(store, watch.scenes, context, tokenizer, pairs, rows))
         reference, _, _ = open_policy(watch.reference)
         self.model, self.reference = model, reference.to(next(model.parameters()).device)
@@ -112,7 +111,7 @@ class ImitationLook:
         among = set(learnt)
         rows = (row for row, scene in enumerate(store.scenes.tolist()) if scene in among)
         pairs = min(options.watch_pairs, store.provenance.num_rollouts // 2)
-        tokenizer = copy.deepcopy(model.tokenizer).cpu()  # logs are read on the CPU, wherever the model is
+        tokenizer = model.tokenizer.on_cpu()
         kept = list(islice(rows, options.watch_scenes))
         self.probes = list(make_probes(store, scenes, context, tokenizer, pairs, kept, rank_by))
         self.model = model

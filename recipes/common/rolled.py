@@ -6,14 +6,16 @@ from collections.abc import Collection, Iterable, Iterator
 from typing import NamedTuple
 
 import torch
+from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from dpa.policy import ContextOptions, MotionLM, make_context
+from dpa.policy import ContextOptions, Decoding, MotionLM, make_context
 from dpa.preferences import PreferenceStore
-from dpa.rollout import lifted, simulated_poses
+from dpa.rollout import lifted, make_collector, simulated_poses
 from envs import keys
 from envs.scene import Scene, SceneSource
+from recipes.common.cli import build
 
 
 class Rolled(NamedTuple):
@@ -52,6 +54,30 @@ def rolled(
             scene = scenes[index]
             trajectories = lifted(scene, poses[row])
             yield Rolled(index, scene, trajectories, controlled[row, : trajectories.shape[1]])
+
+
+def driven(
+    scenes: SceneSource, model: MotionLM, options: ContextOptions, cfg: DictConfig
+) -> Iterator[tuple[int, Tensor]]:
+    """Index and trajectories ``[K, A, 80, 4]`` of every scene, driven by a model.
+
+    Args:
+        scenes: to roll out.
+        model: of the rollouts.
+        options: how the model cuts scenes up, and whom it drives.
+        cfg: with ``num_rollouts``, ``decoding``, ``seed``, ``memory`` and ``device``.
+    """
+    batches = make_collector(
+        scenes,
+        model,
+        num_rollouts=cfg.num_rollouts,
+        decoding=build(Decoding, cfg.decoding, "decoding"),
+        options=options,
+        seed=cfg.seed,
+        memory=cfg.memory,
+        device=cfg.device,
+    )
+    return ((each.index, each.trajectories) for each in rolled(batches, scenes, cfg.num_rollouts))
 
 
 def stored(

@@ -6,7 +6,6 @@ clock, which does not see what a killed process had done.
 
 from __future__ import annotations
 
-import copy
 from dataclasses import asdict
 from pathlib import Path
 
@@ -158,7 +157,7 @@ def likelihood_job(cfg: DictConfig, seed: int, policy: str, split: str) -> None:
         raise ValueError(
             f"{store.folder} holds {len(store)} of {len(scenes)} scenes; run the same command again to fill it."
         )
-    probes = make_probes(store, scenes, options, copy.deepcopy(model.tokenizer).cpu(), pairs)
+    probes = make_probes(store, scenes, options, model.tokenizer.on_cpu(), pairs)
     found = probe(model.to(cfg.device), reference.to(cfg.device), probes, cfg.device)
     drift = divergence(
         model,
