@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import hydra
@@ -38,10 +38,11 @@ from envs.options import differences
 from envs.progress import progress
 from envs.scene import STEP_SECONDS, Scene, SceneSource, select_agents
 from envs.seeding import make_generator
-from recipes.common.cli import CONFIG, build, finished, plain, recipe
+from recipes.common.cli import CONFIG, build, plain, recipe
 from recipes.common.models import open_policy, policies_of, weights_digest
 from recipes.common.rolled import driven
 from recipes.common.scenes import fingerprint, open_splits
+from recipes.studies.rows import read_or_score
 from recipes.studies.tables import StudyTable, tell
 
 Rolls = Iterator[tuple[int, Tensor]]
@@ -158,11 +159,13 @@ def _last(seconds: float) -> int:
     return round(seconds / STEP_SECONDS) - 1
 
 
-def score(scenes: SceneSource, rolls: Rolls, metric: RealismConfig, name: str) -> dict[str, list[float | None]]:
+def score(
+    scenes: SceneSource, roll: Callable[[SceneSource], Rolls], metric: RealismConfig, name: str
+) -> dict[str, list[float | None]]:
     """Each figure of :func:`look` as one value per scene; None where the log has left by then."""
     found: dict[int, dict[str, float]] = {}
     with progress(total=len(scenes), description=name, unit="scene") as bar:
-        for index, trajectories in rolls:
+        for index, trajectories in roll(scenes):
             found[index] = look(scenes[index], trajectories, metric)
             bar.update()
     ordered = [found[index] for index in sorted(found)]
@@ -184,12 +187,8 @@ def measure_gap(cfg: DictConfig, scenes: SceneSource) -> dict[str, dict[str, lis
     }
     gap = {}
     for name, own, roll in rows(cfg):
-        path = Path(cfg.output) / f"{name.replace(':', '').replace(' ', '_').replace('/', '_')}.json"
-        done = finished(path, common | own)
-        if done is None:
-            done = {"options": common | own, "figures": score(scenes, roll(scenes), metric, name)}
-            write_json(path, done)
-        gap[name] = done["figures"]
+        figures = partial(score, scenes, roll, metric, name)
+        gap[name] = read_or_score(cfg.output, name, common | own, "figures", figures)
     return gap
 
 

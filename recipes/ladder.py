@@ -9,7 +9,7 @@ that are there are read back.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import hydra
@@ -27,10 +27,11 @@ from envs.files import write_json
 from envs.progress import progress
 from envs.scene import CURRENT_STEP, STEP_SECONDS, Scene, SceneSource
 from envs.seeding import make_generator
-from recipes.common.cli import CONFIG, finished, finite, plain, recipe
+from recipes.common.cli import CONFIG, finite, plain, recipe
 from recipes.common.models import build_policy, context_options, open_policy, policies_of, policy_config, weights_digest
 from recipes.common.rolled import driven
 from recipes.common.scenes import fingerprint, open_splits
+from recipes.studies.rows import read_or_score
 from recipes.studies.tables import StudyTable, tell
 
 Rung = Callable[[Scene, int, torch.Generator], Tensor]
@@ -155,13 +156,8 @@ def climb(cfg: DictConfig, scenes: SceneSource) -> dict[str, dict]:
     common = {"scenes": fingerprint(scenes), "num_rollouts": cfg.num_rollouts, "seed": cfg.seed, "years": metrics}
     ladder = {}
     for name, own, rollouts in rungs(cfg, scenes):
-        path = Path(cfg.output) / f"{name.replace(' ', '_').replace('/', '_')}.json"
-        decided_by = common | own
-        done = finished(path, decided_by)
-        if done is None:
-            done = {"options": decided_by, "scores": score_rung(scenes, rollouts, years_of(cfg), name)}
-            write_json(path, done)
-        ladder[name] = done["scores"]
+        score = partial(score_rung, scenes, rollouts, years_of(cfg), name)
+        ladder[name] = read_or_score(cfg.output, name, common | own, "scores", score)
     return ladder
 
 
