@@ -6,17 +6,16 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from torch import Tensor
 
 from dpa.report.canvas import INK, blank_figure
-from dpa.report.judged import logged_mishaps
-from dpa.report.panels import MARKS, draw_legend, draw_log_paths, first_new
+from dpa.report.likely import likeliest, mishaps_in_log
+from dpa.report.panels import MARKS, draw_ground, draw_legend, draw_log_paths
 from dpa.report.player import PlayerScene
-from envs.render import draw_agents, draw_map, draw_trails, fit_view, frame_view, pose_tracks, save_picture
+from envs.render import draw_agents, draw_trails, frames_over, pose_tracks, save_picture
 from envs.render.save import Frame
 from envs.scene import CURRENT_STEP, LOG_STEPS, STEP_SECONDS, Scene
 
@@ -36,14 +35,13 @@ class Panel(NamedTuple):
     Attributes:
         axes: where it is drawn.
         tracks: ``[A, 91, 3]`` of all agents, log and rollout.
-        poses: ``[A', 80, ...]`` of the present agents, on which marks stand.
-        first: of each of :data:`~dpa.report.panels.MARKS`, ``[A']`` int64: the first step of the rollout, -1 for none.
+        first: of each of :data:`~dpa.report.panels.MARKS`, ``[A']`` int64: the first step of the rollout at which it
+            happens to a present agent, -1 for none; empty for the log, in which nothing is marked.
     """
 
     axes: Axes
     tracks: Tensor
-    poses: Tensor
-    first: Sequence[Tensor]
+    first: Sequence[Tensor] = ()
 
 
 def film_likely(players: Sequence[PlayerScene], path: str | Path) -> None:
@@ -90,39 +88,24 @@ def _frames(player: PlayerScene) -> Iterator[Frame]:
     places = figure.subplots(1, len(titles), squeeze=False)[0]
     panels = _panels(player, places)
     for axes, title in zip(places, titles, strict=True):
-        frame_view(axes, fit_view(scene, margin=10.0, smallest=25.0, largest=60.0))
-        draw_map(axes, scene)
+        draw_ground(axes, scene)
         axes.set_title(title, fontsize=11, color=INK)
     for axes in places[1:]:
         draw_log_paths(axes, scene, panels[0].tracks)
-    draw_legend(figure, [scene], [panel.first for panel in panels])
-    canvas.draw()
+    draw_legend(figure, [scene], [panel.first for panel in panels[1:]])
+    figure.draw_without_rendering()
     figure.set_layout_engine("none")  # nothing may move any more
-    background = canvas.copy_from_bbox(figure.bbox)
-    steps = list(range(CURRENT_STEP, LOG_STEPS, STRIDE))
-    for step in [*steps, *[steps[-1]] * HELD]:
-        canvas.restore_region(background)
-        for panel in panels:
-            artists = _moment(panel, scene, step)
-            for artist in sorted(artists, key=lambda each: each.get_zorder()):
-                panel.axes.draw_artist(artist)
-                artist.remove()
-        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    steps = [*range(CURRENT_STEP, LOG_STEPS, STRIDE), *[LOG_STEPS - 1] * HELD]
+    return frames_over(canvas, ([each for panel in panels for each in _moment(panel, scene, step)] for step in steps))
 
 
 def _panels(player: PlayerScene, places: Sequence[Axes]) -> list[Panel]:
     """The log, and the most likely rollout of each policy."""
-    scene = player.scene
-    logged = [flags[scene.agents.present].any(-1) for flags in logged_mishaps(scene)]
-    log = pose_tracks(scene)
-    present = log[scene.agents.present, CURRENT_STEP + 1 :]
-    never = [flags.new_full(flags.shape, -1, dtype=int) for flags in logged]
-    panels = [Panel(places[0], log, present, never)]
+    scene, logged = player.scene, mishaps_in_log(player.scene)
+    panels = [Panel(places[0], pose_tracks(scene))]
     for axes, judged in zip(places[1:], player.rollouts.values(), strict=True):
-        row = int(judged.likelihood_rank.argmin())
-        happens = judged.collides[row], judged.offroad[row]
-        first = [first_new(flags, before) for flags, before in zip(happens, logged, strict=True)]
-        panels.append(Panel(axes, pose_tracks(scene, judged.poses[row]), judged.poses[row], first))
+        row, first = likeliest(judged, logged)
+        panels.append(Panel(axes, pose_tracks(scene, judged.poses[row]), first))
     return panels
 
 
@@ -130,11 +113,11 @@ def _moment(panel: Panel, scene: Scene, step: int) -> list[Artist]:
     """All that moves at one step, and the marks that are there by then."""
     artists = draw_trails(panel.axes, scene, panel.tracks, CURRENT_STEP, step, alpha=0.5, width=1.2)
     artists += draw_agents(panel.axes, scene, panel.tracks, step)
-    done = step - CURRENT_STEP - 1
-    for first, (marker, color) in zip(panel.first, MARKS.values(), strict=True):
-        there = (first >= 0) & (first <= done)
+    now = panel.tracks[scene.agents.present, step, :2]
+    for first, (marker, color) in zip(panel.first, MARKS.values(), strict=False):
+        there = (first >= 0) & (first < step - CURRENT_STEP)
         if there.any():
-            x, y = panel.poses[there, min(done, panel.poses.shape[1] - 1), :2].T.numpy()
+            x, y = now[there].T.numpy()
             artists.append(
                 panel.axes.scatter(x, y, s=60, marker=marker, color=color, edgecolors="white", lw=0.9, zorder=15)
             )

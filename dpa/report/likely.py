@@ -64,7 +64,7 @@ def plot_likely(players: Sequence[PlayerScene], path: str | Path) -> None:
 def _draw_scene(places: Sequence[Axes], scene: Scene, rollouts: Mapping[str, JudgedRollouts]) -> list[list[Tensor]]:
     """The log in the first place, a policy in each that follows; returns of each policy the steps that are marked."""
     driven = pose_tracks(scene)
-    logged = [flags[scene.agents.present].any(-1) for flags in logged_mishaps(scene)]
+    logged = mishaps_in_log(scene)
     draw_panel(places[0], scene, driven, f"log of {scene.scene_id}")
     found = []
     for axes, (name, judged) in zip(places[1:], rollouts.items(), strict=False):
@@ -73,14 +73,31 @@ def _draw_scene(places: Sequence[Axes], scene: Scene, rollouts: Mapping[str, Jud
     return found
 
 
+def mishaps_in_log(scene: Scene) -> list[Tensor]:
+    """Of each of :data:`~dpa.report.panels.MARKS`, ``[A]`` bool: it happens to the present agent in the log."""
+    return [flags[scene.agents.present].any(-1) for flags in logged_mishaps(scene)]
+
+
+def likeliest(judged: JudgedRollouts, logged: Sequence[Tensor]) -> tuple[int, list[Tensor]]:
+    """The row of the most likely rollout, and of each of :data:`~dpa.report.panels.MARKS` its first steps.
+
+    Args:
+        judged: rollouts of a policy.
+        logged: from :func:`mishaps_in_log`.
+
+    Returns:
+        The row, and ``[A]`` int64 each: the first step at which an agent does what it never does in the log; -1: none.
+    """
+    row = int(judged.likelihood_rank.argmin())
+    happens = judged.collides[row], judged.offroad[row]
+    return row, [first_new(flags, before) for flags, before in zip(happens, logged, strict=True)]
+
+
 def _draw_likeliest(
     axes: Axes, scene: Scene, name: str, judged: JudgedRollouts, logged: Sequence[Tensor]
 ) -> list[Tensor]:
-    row = int(judged.likelihood_rank.argmin())
+    row, first = likeliest(judged, logged)
     poses, nats, distance = judged.poses[row], float(judged.log_likelihood[row]), float(judged.distance[row])
-    first = [
-        first_new(flags[row], before) for flags, before in zip((judged.collides, judged.offroad), logged, strict=True)
-    ]
     draw_panel(axes, scene, pose_tracks(scene, poses), f"{name}\n{nats:.2f} nats per token, distance {distance:.1f}")
     draw_marks(axes, poses, first)
     return first

@@ -26,6 +26,12 @@ LEGEND_ENTRY = 1.45
 LOG_PATH = {"color": LOG_COLOR, "lw": 0.8, "ls": (0, (2, 1.5))}
 
 
+def draw_ground(axes: Axes, scene: Scene) -> None:
+    """Set the window of a panel and draw the map."""
+    frame_view(axes, fit_view(scene, margin=10.0, smallest=25.0, largest=60.0))  # the panels are small
+    draw_map(axes, scene)
+
+
 def draw_panel(axes: Axes, scene: Scene, tracks: Tensor, title: str) -> None:
     """Map, agents at the current step, and where they go from there.
 
@@ -35,8 +41,7 @@ def draw_panel(axes: Axes, scene: Scene, tracks: Tensor, title: str) -> None:
         tracks: ``[A, L, 3]``, of :func:`~envs.render.pose_tracks`.
         title: above it.
     """
-    frame_view(axes, fit_view(scene, margin=10.0, smallest=25.0, largest=60.0))  # the panels are small
-    draw_map(axes, scene)
+    draw_ground(axes, scene)
     draw_trails(axes, scene, tracks, CURRENT_STEP, tracks.shape[1] - 1, alpha=1.0, width=1.5)
     draw_agents(axes, scene, tracks, CURRENT_STEP)
     axes.set_title(title, fontsize=8.5, color=INK)

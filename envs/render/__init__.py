@@ -9,7 +9,7 @@ once and then only what moves. From a shell::
 """
 
 from envs.render.layers import View, box_corners, draw_agents, draw_map, draw_trails, fit_view, frame_view, pose_tracks
-from envs.render.picture import draw_scene, render_frame, render_frames
+from envs.render.picture import draw_scene, frames_over, render_frame, render_frames
 from envs.render.save import check_writable, save_picture
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "draw_trails",
     "fit_view",
     "frame_view",
+    "frames_over",
     "pose_tracks",
     "render_frame",
     "render_frames",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -92,14 +92,27 @@ def render_frames(
     frame_view(axes, view or fit_view(scene))
     draw_map(axes, scene)
     _draw_legend(axes, scene)
+    yield from frames_over(
+        canvas, (_draw_moment(axes, scene, tracks, step, trails=trails, clock=True) for step in steps)
+    )
+
+
+def frames_over(canvas: FigureCanvasAgg, moments: Iterable[Sequence[Artist]]) -> Iterator[NDArray[np.uint8]]:
+    """Frames of an animation: what the figure has is drawn once, and what moves over it.
+
+    Args:
+        canvas: of a figure.
+        moments: the artists of each frame, made just before it, which are taken away again.
+
+    Yields:
+        ``[H, W, 3]`` uint8.
+    """
     canvas.draw()
-    background = canvas.copy_from_bbox(figure.bbox)
-    for step in steps:
+    background = canvas.copy_from_bbox(canvas.figure.bbox)
+    for artists in moments:
         canvas.restore_region(background)
-        for artist in sorted(
-            _draw_moment(axes, scene, tracks, step, trails=trails, clock=True), key=lambda a: a.get_zorder()
-        ):
-            axes.draw_artist(artist)
+        for artist in sorted(artists, key=lambda each: each.get_zorder()):
+            artist.axes.draw_artist(artist)
             artist.remove()
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
