@@ -1,8 +1,7 @@
 """Muon: momentum whose matrices are made orthogonal, and AdamW for all that is no matrix.
 
 PyTorch has a Muon too, for matrices alone, one by one, in bfloat16. Here one optimiser holds all parameters, so that
-schedule, checkpoint and clipping see one, and matrices of one shape move together, in float32: on a CPU a step of forty
-small ones takes a fifth of the time.
+schedule, checkpoint and clipping see one, and matrices of one shape move together, in float32.
 """
 
 from __future__ import annotations
@@ -109,11 +108,8 @@ class Muon(AdamW):
     def _momentum(self, parameter: Tensor) -> Tensor:
         """The mean of past gradients, a step ahead (Nesterov)."""
         state = self.state[parameter]
-        if not state:
-            state |= {
-                "step": torch.zeros(()),
-                "momentum": torch.zeros_like(parameter),
-            }  # AdamW reads every state's step
+        if not state:  # its step is what AdamW reads of every state
+            state |= {"step": torch.zeros(()), "momentum": torch.zeros_like(parameter)}
         state["step"] += 1
         state["momentum"].lerp_(parameter.grad, 1 - MOMENTUM)
         return parameter.grad.lerp(state["momentum"], MOMENTUM)

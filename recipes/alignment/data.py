@@ -5,6 +5,7 @@ from __future__ import annotations
 from omegaconf import DictConfig, OmegaConf
 
 from envs import keys
+from recipes.common.limits import is_number
 
 SIDES = {
     "pairs": "pairs",
@@ -103,7 +104,7 @@ def _check(data: DictConfig, held: int, given: DictConfig) -> None:
     if data.kind in ON_POLICY:
         if type(data.get("candidates")) is not int or data.candidates < 1:
             raise ValueError(f"method.data.candidates must be 1 or more, got {data.get('candidates')!r}.")
-        if not isinstance(data.get("recovery"), int | float) or not 0 < data.recovery <= 1:
+        if not is_number(data.get("recovery")) or not 0 < data.recovery <= 1:
             raise ValueError(f"method.data.recovery must lie in (0, 1], got {data.get('recovery')!r}.")
         return
     if data.kind in RANKED and data.rank_by not in (keys.DISTANCE, keys.ADE):

@@ -69,6 +69,8 @@ def test_more_rows_in_a_pass_change_rounding_alone(
         (["method=dpa_omf"], "preferences is not given"),
         (["method.data.candidates=0"], "method.data.candidates"),
         (["method.data.candidates=170"], "candidates must be 1 to 169"),
+        (["method.data.recovery=0"], "method.data.recovery must lie in (0, 1], got 0"),
+        (["method.data.recovery=true"], "method.data.recovery must lie in (0, 1], got True"),
         (["method.loss.kind=contrastive"], "learns from pairs"),
     ],
 )
