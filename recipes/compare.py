@@ -12,7 +12,7 @@ can. Run the same command again to go on after a kill.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import product
 from typing import Any
 
@@ -87,20 +87,25 @@ def train_policies(cfg: DictConfig, stages: Stages) -> None:
 
 
 def choose(cfg: DictConfig, stages: Stages) -> Chosen:
-    """Checkpoint and decoding of each method, both at once, by mean realism over seeds on the tuning scenes."""
+    """Checkpoint and decoding of each method, both at once, by mean realism over seeds on the tuning scenes.
+
+    What has one checkpoint and one decoding needs no choice, and is not rolled out for it.
+    """
     policies = {method: [method] for method in shown_policies(cfg)}
     if cfg.experiment.checkpoints == "select":
         policies |= {method: [*snapshots_of(cfg, method), method] for method in cfg.methods}
     runs = {method: [Run(*each) for each in product(among, decodings(cfg))] for method, among in policies.items()}
-    stages.run("tune", evaluate_job, cfg, jobs_of(cfg, {run for among in runs.values() for run in among}, "tune"))
+    tuned = {run for among in runs.values() if len(among) > 1 for run in among}
+    stages.run("tune", evaluate_job, cfg, jobs_of(cfg, tuned, "tune"))
     common = Decoding(*cfg.decoding.common)
 
-    def best(among: Iterable[Run]) -> Run:
-        return max(among, key=lambda run: tuning_realism(cfg, run))
+    def best(among: Sequence[Run]) -> Run:
+        return max(among, key=lambda run: tuning_realism(cfg, run)) if len(among) > 1 else among[0]
 
     return Chosen(
-        common={method: best(run for run in among if run.decoding == common) for method, among in runs.items()},
+        common={method: best([run for run in among if run.decoding == common]) for method, among in runs.items()},
         best={method: best(among) for method, among in runs.items()},
+        tuned=frozenset(tuned),
     )
 
 
@@ -165,8 +170,8 @@ def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.compare``."""
     found = compare(cfg)
     print_table(found["rows"], found["paired"], title=f"{found['title']}: all at the same decoding")
-    own = found["own_best"]
-    print_table(own["rows"], own["paired"], title="Each at its own best decoding, chosen on the tuning scenes")
+    if (own := found["own_best"])["rows"] != found["rows"]:
+        print_table(own["rows"], own["paired"], title="Each at its own best decoding, chosen on the tuning scenes")
     print(f"numbers: {runs_of(cfg).experiment(cfg.experiment.name)}")
     print(f"report: {report(runs_of(cfg).root, runs_of(cfg).root / 'index.html')}")
 

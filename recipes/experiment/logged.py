@@ -78,7 +78,8 @@ def _tables(experiment: Experiment, runs: RunFolder) -> Iterator[tuple[str, Cell
         yield "likelihood/methods", _measured(summarise(experiment.likelihood), FIGURES)
         if learnt := who_learns(experiment, Evaluations(runs.root)):
             yield "learnt/methods", _learnt(learnt)
-    yield "tuning/decodings", _measured(summarise(experiment.tuning), TUNING)
+    if experiment.tuning:
+        yield "tuning/decodings", _measured(summarise(experiment.tuning), TUNING)
     if rows := list(_equal_sharpness(experiment, Evaluations(runs.root))):
         titles = ["method", *DECODING.values(), "spread [m]", "beyond [m]", "Δ realism", "low", "high"]
         yield "equal_sharpness/methods", (titles, rows)

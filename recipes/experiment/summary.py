@@ -32,10 +32,12 @@ class Chosen(NamedTuple):
     Attributes:
         common: method -> its last policy or a snapshot, the best one at the common decoding.
         best: method -> the best policy and decoding.
+        tuned: all that was rolled out on the tuning scenes for it.
     """
 
     common: dict[str, Run]
     best: dict[str, Run]
+    tuned: frozenset[Run]
 
 
 Shown = tuple[str, Run]
@@ -135,7 +137,8 @@ def summarise_experiment(
 
     ``rows`` and ``paired`` compare at the common decoding, and show the reference at the others of the grid beside
     them: sharper sampling alone can pass for alignment. ``own_best`` compares every method at its own best decoding
-    with the reference at its own. ``tuning`` holds every method at every decoding, on the tuning scenes.
+    with the reference at its own. ``tuning`` holds every method at every decoding, on the tuning scenes; nothing of a
+    method that had one checkpoint and one decoding.
 
     Args:
         cfg: of the experiment.
@@ -149,6 +152,7 @@ def summarise_experiment(
     others = [(REFERENCE, Run(REFERENCE, each)) for each in grid if each != common]
     results = Results(cfg, [*at_common, *others, *at_best])
     standard = experiment["versus"] or experiment["headline"]
+    tried = [(method, run._replace(decoding=each)) for method, run in at_best for each in grid]
     rivals = [run for run in at_best if run[0] not in (REFERENCE, standard)]
     return {name: experiment[name] for name in TOLD} | {
         "versus": standard,
@@ -171,7 +175,7 @@ def summarise_experiment(
             "paired": results.paired(at_best[1:], at_best[0]),
             "versus": results.paired(rivals, (standard, chosen.best[standard])),
         },
-        "tuning": results.tuning([(method, run._replace(decoding=each)) for method, run in at_best for each in grid]),
+        "tuning": results.tuning([shown for shown in tried if shown[1] in chosen.tuned]),
         "likelihood": [results.likelihood(method, run.policy, seed) for method, run in at_best for seed in cfg.seeds],
         "curves": {
             method: {str(seed): results.runs.relative(results.runs.training(seed, method)) for seed in cfg.seeds}

@@ -275,6 +275,17 @@ def test_checkpoint_and_decoding_are_chosen_together_by_the_mean_over_seeds(tmp_
     assert len(asked) == len(set(asked)) == 2 * 2 * (1 + 2 * 5), "each policy of each seed once at each decoding"
 
 
+def test_where_there_is_nothing_to_choose_no_tuning_scene_is_rolled_out(tmp_path: Path) -> None:
+    options = "decoding.grid=[[0.95,1.0]]", "experiment.checkpoints=last", "alignment.snapshots=[40]"
+    asked: list[tuple] = []
+    chosen = choose(
+        configuration(f"output={tmp_path}", *options), SimpleNamespace(run=lambda *given: asked.extend(given[-1]))
+    )
+    assert not asked and not chosen.tuned
+    assert chosen.best == chosen.common
+    assert chosen.best["dpa_omf"] == Run("dpa_omf", Decoding(0.95, 1.0))
+
+
 def test_each_round_draws_by_a_seed_of_its_own() -> None:
     rounds = configuration("experiment=rounds")
     seeds = [

@@ -75,6 +75,7 @@ def test_a_comparison_runs_from_a_reference_of_the_zoo(run: Callable, options: C
     assert outcome.status == 0, outcome.err
     assert "reference" in outcome.out and (tmp_path / "index.html").is_file()
     assert not (tmp_path / "seed_0/reference/checkpoints").exists(), "nothing was pre-trained"
+    assert "chosen on the tuning scenes" not in outcome.out and not list(tmp_path.glob("seed_0/*/tune_*.json"))
 
 
 if __name__ == "__main__":
