@@ -68,6 +68,14 @@ def test_the_demo_has_a_configuration(run: Callable) -> None:
     assert OmegaConf.create(outcome.out).model.size == "nano"
 
 
+@pytest.mark.parametrize(("size", "rate"), [("nano", 6e-3), ("paper", 4e-3)])
+def test_a_size_is_trained_at_the_rate_that_it_bears(run: Callable, size: str, rate: float) -> None:
+    outcome = run("pretrain", "--config-name", "reference", f"model={size}", "--cfg", "job")
+    assert outcome.status == 0, outcome.err
+    cfg = OmegaConf.create(outcome.out)
+    assert (cfg.model.size, cfg.pretraining.lr) == (size, rate)
+
+
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_an_unknown_key_is_told_by_name(run: Callable, recipe: str) -> None:
     outcome = run(recipe, "scenes.trains=somewhere")
