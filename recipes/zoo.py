@@ -22,11 +22,10 @@ from rich.console import Console
 from rich.table import Table
 
 from dpa import zoo
-from dpa.report.curves import read_curves
 from dpa.report.experiment import read_json
 from dpa.report.table import print_whole
 from dpa.training.checkpoint import load_policy
-from dpa.training.run import SECONDS
+from dpa.training.run import seconds_trained
 from envs.files import write_json
 from recipes.common.cli import refused
 from recipes.common.models import build_policy, digest_of
@@ -59,12 +58,10 @@ def make_card(run: Path, evaluations: dict[str, Path]) -> dict[str, Any]:
                 f"{', '.join(FREE_SOURCES)} alone: weights may not be given away where the licence of the scenes binds."
             )
     options = read_json(run / "result.json")["options"]
-    steps = options["pretraining"]["steps"]
-    seconds = read_curves(run)[SECONDS]["value"][-1] * steps
     return {
         "sha256": zoo.checksum(file),
         "parameters": sum(value.numel() for value in build_policy(config).parameters()),
-        "hours": round(seconds / SECONDS_OF_AN_HOUR, 2),
+        "hours": round(seconds_trained(run) / SECONDS_OF_AN_HOUR, 2),
         "tune_nll": made["tune_nll"],
         "seed": made["seed"],
         "options": options,

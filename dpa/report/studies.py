@@ -43,6 +43,38 @@ def plot_validity(found: Mapping[str, Mapping[str, Any]], path: str | Path) -> N
     save_figure(figure, path)
 
 
+def plot_references(
+    curves: Mapping[str, Sequence[tuple[int, float]]], realism: Mapping[str, Interval | None], path: str | Path
+) -> None:
+    """Draw how pre-trainings learn, and how realistic that makes them.
+
+    Left the negative log-likelihood of the tuning scenes along the steps, that of the start left out; right realism
+    with its 95 % interval over scenes against the lowest of each.
+
+    Args:
+        curves: by training, ``(step, NLL per token [nats])``.
+        realism: likewise; None where no scene has any.
+        path: PNG to write.
+    """
+    figure = blank_figure(10, 4)
+    left, right = figure.subplots(1, 2, width_ratios=[1.5, 1])
+    for color, (name, curve) in zip(_colours(len(curves)), curves.items(), strict=True):
+        steps, nll = zip(*(row for row in curve if row[0]), strict=True)
+        left.plot(steps, nll, "o-", color=color, ms=3, lw=1.4, label=name)
+        if (value := realism[name]) is not None:
+            right.plot([min(nll)] * 2, [value.low, value.high], color=color, lw=1.4, alpha=0.5)
+            right.plot(min(nll), value.mean, "o", color=color, ms=6, mec="white", mew=1)
+    left.set_xscale("log")
+    left.set_xlabel("step", fontsize=8, color=INK)
+    left.set_title("NLL of the tuning scenes, per token [nats]")
+    left.legend(frameon=False, fontsize=7, labelcolor=INK)
+    right.set_xlabel("lowest NLL of the tuning scenes", fontsize=8, color=INK)
+    right.set_title("realism")
+    for axes in (left, right):
+        calm(axes, "both")
+    save_figure(figure, path)
+
+
 def plot_sensitivity(
     agreement: Mapping[str, Interval], margins: Sequence[tuple[str, Mapping[str, Interval]]], path: str | Path
 ) -> None:

@@ -10,12 +10,22 @@ from typing import Any, Literal
 
 from dpa.training.checkpoint import Checkpointer, Stateful, capture, restore
 from dpa.training.distributed import ALONE, Ranks
-from dpa.training.loggers import Backend, make_logger
+from dpa.training.loggers import Backend, make_logger, read_curve
 from envs.options import differences
 from envs.progress import progress
 
 SECONDS = "time/seconds_per_step"
 """Curve of what a step takes [s], the mean from the first one on."""
+
+
+def seconds_trained(folder: Path) -> float:
+    """What the steps of a training run took [s], whichever processes made them.
+
+    Raises:
+        FileNotFoundError: the folder has no curve of it.
+    """
+    steps, seconds_per_step = read_curve(folder, SECONDS)[-1]
+    return steps * seconds_per_step
 
 
 def _refuse_other_options(folder: Path, config: Mapping[str, Any]) -> None:

@@ -14,8 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from dpa.policy import Decoding
 from dpa.report.table import REFERENCE
-from dpa.training.loggers import read_curve
-from dpa.training.run import SECONDS
+from dpa.training.run import seconds_trained
 from envs.files import write_bytes, write_json
 from envs.options import differences
 from envs.seeding import make_generator
@@ -119,12 +118,6 @@ def align_job(cfg: DictConfig, seed: int, method: str) -> dict[str, float]:
             section=f"methods.{method}",
         )
     return {"align": seconds_trained(folder)}
-
-
-def seconds_trained(folder: Path) -> float:
-    """What the steps of a training run took [s], whichever processes made them."""
-    steps, seconds_per_step = read_curve(folder, SECONDS)[-1]
-    return steps * seconds_per_step
 
 
 def evaluate_job(cfg: DictConfig, seed: int, policy: str, split: str, top_p: float, temperature: float) -> None:

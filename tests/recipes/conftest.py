@@ -54,6 +54,7 @@ SECTIONS = {
     "spread": ("threads", "scenes"),
     "ladder": ("threads", "scenes", "model"),
     "gap": ("threads", "scenes"),
+    "references": ("threads", "scenes", "collection.ranking", "evaluation"),
     "tokens": ("threads", "scenes", "model"),
     "look": ("threads", "scenes"),
     "validity": ("threads", "scenes"),

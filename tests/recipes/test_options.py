@@ -25,9 +25,10 @@ from recipes.common.scenes import fingerprint, open_splits
 from recipes.studies.motions import MotionShelf
 
 RECIPES = (
-    "pretrain", "collect", "align", "evaluate", "play", "ladder", "gap", "tokens", "compare", "validity", "sensitivity"
+    "pretrain", "collect", "align", "evaluate", "play", "ladder", "gap", "references", "tokens", "compare", "validity",
+    "sensitivity",
 )  # fmt: skip
-WITHOUT_POLICY = ("pretrain", "ladder", "gap", "tokens", "compare", "play", "validity", "sensitivity")
+WITHOUT_POLICY = ("pretrain", "ladder", "gap", "references", "tokens", "compare", "play", "validity", "sensitivity")
 pytestmark = pytest.mark.usefixtures("stores")
 
 

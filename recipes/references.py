@@ -1,0 +1,89 @@
+"""Pre-trainings side by side: what more steps, scenes and parameters give.
+
+    python -m recipes.references 'policies=[runs/nano_*/policy.pt,runs/paper/policy.pt]'
+
+Of each training its options, its hours, the likelihood that it came to and how its policy drives; and a figure of all
+curves, with realism against likelihood. Run the same command again to go on after a kill: policies that are scored are
+read back.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import hydra
+from omegaconf import DictConfig
+
+from dpa.policy import Decoding
+from dpa.report.experiment import read_json
+from dpa.report.statistics import Interval, summary
+from dpa.report.studies import plot_references
+from dpa.training.loggers import read_curve
+from dpa.training.run import seconds_trained
+from recipes.common.cli import CONFIG, build, recipe
+from recipes.common.models import open_policy, policies_of
+from recipes.common.scenes import open_splits
+from recipes.evaluate import evaluate
+from recipes.studies.tables import Cell, StudyTable, tell
+
+NLL = "tune/nll"
+FIGURES = {
+    "realism": "realism",
+    "collision_rate": "collision",
+    "offroad_rate": "off-road",
+    "min_ade": "minADE [m]",
+    "wrong_way": "wrong way",
+}
+"""Figures of the table and their titles."""
+COLUMNS = ["parameters [M]", "steps", "rate", "hours", "tuning NLL", *FIGURES.values()]
+
+
+def measured(policy: Path, result: dict[str, Any], parameters: int) -> list[Cell]:
+    """The row of one training: what it was, how far it came, and how its policy drives.
+
+    Args:
+        policy: in the folder of the training.
+        result: what :func:`~recipes.evaluate.evaluate` gives for it.
+        parameters: of the model.
+
+    Raises:
+        OSError: the folder has no result or no curves of a pre-training.
+    """
+    training = read_json(policy.parent / "result.json")["options"]["pretraining"]
+    return [
+        parameters / 1e6,
+        training["steps"],
+        training["lr"],
+        seconds_trained(policy.parent) / 3600,
+        min(value for _, value in read_curve(policy.parent, NLL)),
+        *(_over_scenes(result["per_scene"][figure]) for figure in FIGURES),
+    ]
+
+
+def _over_scenes(values: list[float | None]) -> Interval | None:
+    known = [value for value in values if value is not None]
+    return summary([known]) if known else None
+
+
+@hydra.main(**CONFIG, config_name="references")
+@recipe
+def main(cfg: DictConfig) -> None:
+    """Entry point of ``python -m recipes.references``."""
+    policies, scenes = policies_of(cfg), open_splits(cfg.scenes)[cfg.split]
+    curves = {name: read_curve(path.parent, NLL) for name, path in policies.items()}
+    rows, output, decoding = {}, Path(cfg.output), build(Decoding, cfg.decoding, "decoding")
+    for name, path in policies.items():
+        result = evaluate(cfg, scenes, path, decoding, cfg.seed, output / f"{name.replace('/', '_')}.json")
+        parameters = sum(value.numel() for value in open_policy(path, cfg.device)[0].parameters())
+        rows[name] = measured(path, result, parameters)
+    realism = {name: row[COLUMNS.index("realism")] for name, row in rows.items()}
+    plot_references(curves, realism, output / "references.png")
+    table = StudyTable("references", f"{len(scenes)} scenes", ["training", *COLUMNS], rows, signed=False)
+    tell(cfg, [table], {"references": output / "references.png"})
+    print(f"figure: {output / 'references.png'}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
