@@ -291,6 +291,7 @@ def study(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     return read_study(folder)
 
 
+@pytest.mark.slow
 def test_the_tables_of_the_results_are_those_of_the_studies_beside_them(study: Study) -> None:
     told = (REPOSITORY / "docs" / "results.md").read_text(encoding="utf-8")
     evaluations = Evaluations(study.folder)
@@ -364,6 +365,7 @@ def options_told(source: str, experiment: str) -> DictConfig:
     return found
 
 
+@pytest.mark.slow
 def test_the_study_beside_the_results_has_the_options_that_its_command_gives(study: Study) -> None:
     """Of all that decides a result; where scenes are kept, and what was shown, may differ."""
     for experiment in study.experiments.values():
@@ -431,6 +433,7 @@ def test_the_tables_of_a_study_of_rankings_are_those_of_the_values_of_its_scenes
     assert [made["scenes"][split] for split in SPLITS] == [given["scenes"][split] for split in SPLITS]
 
 
+@pytest.mark.slow
 def test_a_reader_gets_the_intervals_of_a_study_from_the_values_of_its_scenes(study: Study) -> None:
     for experiment in study.experiments.values():
         content = json.loads((study.folder / "experiments" / f"{experiment.name}.json").read_text())["own_best"]
