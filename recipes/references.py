@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 
 from dpa.policy import Decoding
 from dpa.report.experiment import read_json
-from dpa.report.statistics import Interval, summary
+from dpa.report.statistics import summary
 from dpa.report.studies import plot_references
 from dpa.training.loggers import read_curve
 from dpa.training.run import seconds_trained
@@ -30,14 +30,13 @@ from recipes.studies.tables import Cell, StudyTable, tell
 
 NLL = "tune/nll"
 FIGURES = {
-    "realism": "realism",
     "collision_rate": "collision",
     "offroad_rate": "off-road",
     "min_ade": "minADE [m]",
     "wrong_way": "wrong way",
 }
-"""Figures of the table and their titles."""
-COLUMNS = ["parameters [M]", "steps", "rate", "hours", "tuning NLL", *FIGURES.values()]
+"""Figures of the table beside realism, means over scenes, and their titles."""
+COLUMNS = ["parameters [M]", "1,000 steps", "rate", "hours", "tuning NLL", "realism", *FIGURES.values()]
 
 
 def measured(policy: Path, result: dict[str, Any], parameters: int) -> list[Cell]:
@@ -51,20 +50,17 @@ def measured(policy: Path, result: dict[str, Any], parameters: int) -> list[Cell
     Raises:
         OSError: the folder has no result or no curves of a pre-training.
     """
+    realism = [value for value in result["per_scene"]["realism"] if value is not None]
     training = read_json(policy.parent / "result.json")["options"]["pretraining"]
     return [
         parameters / 1e6,
-        training["steps"],
+        training["steps"] / 1e3,
         training["lr"],
         seconds_trained(policy.parent) / 3600,
         min(value for _, value in read_curve(policy.parent, NLL)),
-        *(_over_scenes(result["per_scene"][figure]) for figure in FIGURES),
+        summary([realism]) if realism else None,
+        *(result["mean"][figure] for figure in FIGURES),
     ]
-
-
-def _over_scenes(values: list[float | None]) -> Interval | None:
-    known = [value for value in values if value is not None]
-    return summary([known]) if known else None
 
 
 @hydra.main(**CONFIG, config_name="references")

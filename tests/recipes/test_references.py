@@ -33,7 +33,7 @@ def test_every_training_has_a_row_and_a_curve_and_is_scored_once(
     assert rows.keys() == {"long", "short"}
     for name, steps in (("short", 3), ("long", 6)):
         parameters, seen, _, _, nll, *_ = (cell.split()[0] for cell in rows[name])
-        assert (float(seen), float(parameters)) == (steps, 0.153)
+        assert (float(seen), float(parameters)) == (steps / 1000, 0.153)
         lowest = min(value for _, value in read_curve(trained / name, "tune/nll"))
         assert float(nll) == pytest.approx(lowest, abs=5e-4)
     assert imread(tmp_path / "references.png").ndim == 3
