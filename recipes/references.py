@@ -67,7 +67,7 @@ def measured(policy: Path, result: dict[str, Any], parameters: int) -> list[Cell
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.references``."""
-    policies, scenes = policies_of(cfg), open_splits(cfg.scenes)[cfg.split]
+    scenes, policies = open_splits(cfg.scenes)[cfg.split], policies_of(cfg)
     curves = {name: read_curve(path.parent, NLL) for name, path in policies.items()}
     rows, output, decoding = {}, Path(cfg.output), build(Decoding, cfg.decoding, "decoding")
     for name, path in policies.items():
