@@ -39,6 +39,7 @@ def test_it_learns_from_logs_and_tells_how_well_they_are_followed(
     assert load_policy(tmp_path / "policy.pt")[2]["method"] == "cat_k"
 
 
+@pytest.mark.slow
 def test_a_run_that_is_cut_goes_on_to_the_same_weights(
     run: Callable, options: Callable, kill_when: Callable, origin: Path, tmp_path: Path
 ) -> None:

@@ -230,6 +230,7 @@ def test_scenes_without_realism_are_refused() -> None:
 
 
 # --- the recipe -----------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_the_recipe_goes_on_after_a_kill_and_gives_what_it_would_have_given(
     run: Callable, options: Callable, policy: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

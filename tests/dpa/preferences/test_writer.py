@@ -118,7 +118,8 @@ def test_four_processes_that_append_overlapping_scenes_store_each_once(tmp_path:
     assert_whole(tmp_path)
 
 
-@pytest.mark.parametrize("kills", [4, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kills", [4, 50])
 def test_writers_killed_at_random_moments_leave_what_one_that_lives_leaves(tmp_path: Path, kills: int) -> None:
     """One of two writers at a time is killed; a store that is full before there were enough kills is begun anew."""
     folders = (tmp_path / str(number) for number in itertools.count())
