@@ -222,6 +222,7 @@ def training_items(
         context_options(cfg.model),
         augment=build(Augmentation, options.augmentation, "pretraining.augmentation"),
         noise=options.noise,
+        recovery=options.recovery,
         max_agents=options.max_agents,
         keep_gib=options.keep_gib,
     )

@@ -10,7 +10,7 @@ from dpa.policy.actor import Contexts, MotionActor
 from dpa.policy.motionlm import MotionLM
 from envs import keys
 from envs.geometry.boxes import box_corners
-from envs.geometry.frames import to_local, to_world
+from envs.geometry.frames import beside, to_local
 
 
 class ClosestActor(MotionActor):
@@ -90,9 +90,9 @@ class ClosestActor(MotionActor):
         (logged, valid), before = decisions, (step - 1).clamp(min=0)  # [S, A, T, F, ...]
         poses, current = logged[rows, :, step], recent[..., -1, :]
         # Nothing is left of the offset where the log had no pose to be beside, nor before the first decision.
-        beside = valid[rows, :, before, -1] & (step > 0)[:, None]
-        left = (1 - self.recovery) * to_local(current, logged[rows, :, before, -1]) * beside[..., None]
-        return to_local(to_world(left[..., None, :], poses), current[..., None, :]), valid[rows, :, step, -1]
+        left = (1 - self.recovery) * (valid[rows, :, before, -1] & (step > 0)[:, None])[..., None]
+        target = beside(poses, current, logged[rows, :, before, -1], left)
+        return to_local(target, current[..., None, :]), valid[rows, :, step, -1]
 
     def _apart(self, tokens: Tensor, target: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
         """``[B, A, K]``: mean distance of the box's corners at the ends of tokens from those at the target [m]."""

@@ -9,7 +9,7 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor, nn
 
-from envs.geometry.frames import to_local, to_world
+from envs.geometry.frames import beside, to_local, to_world
 
 
 class TokenizedTracks(NamedTuple):
@@ -79,13 +79,15 @@ class MotionTokenizer(nn.Module):
         kind: Tensor,
         *,
         noise: float = 0.0,
+        recovery: float = 1.0,
         drawn: Tensor | None = None,
     ) -> TokenizedTracks:
         """Tokenize tracks greedily on the reconstructed track, so that errors do not add up (method.md section 2).
 
         A token is valid up to the first decision in which the log misses its last pose. With ``noise``, some tokens
         are replaced by neighbours and the labels lead back to the log: whoever learns the labels learns to recover
-        from its own errors (Philion et al. 2024, section 3.3).
+        from its own errors (Philion et al. 2024, section 3.3). Where tokens change a velocity, to be back at once is
+        harsh: with a ``recovery`` below 1 the labels come back slowly.
 
         Args:
             poses: ``[*, A, T * F, 3]`` logged poses after the current step.
@@ -95,6 +97,7 @@ class MotionTokenizer(nn.Module):
 
         Keyword Args:
             noise: probability with which a token is replaced.
+            recovery: share of the offset from the log, seen from the log's own pose, that a label makes good.
             drawn: ``[*, A, T, 3]`` uniform in [0, 1), from which the noise is taken; needed only where there is any.
         """
         decisions = poses.unflatten(-2, (-1, self.steps))
@@ -102,7 +105,11 @@ class MotionTokenizer(nn.Module):
         token_valid = ends.cummin(-1).values
         tokens, labels, tracks = [], [], []
         for step in range(decisions.shape[-3]):
-            target = to_local(decisions[..., step, :, :], recent[..., -1:, :])
+            target = decisions[..., step, :, :]
+            if noise and recovery < 1 and step:  # nothing is left where the log had no pose to be beside
+                left = (1 - recovery) * ends[..., step - 1, None]
+                target = beside(target, recent[..., -1, :], decisions[..., step - 1, -1, :], left)
+            target = to_local(target, recent[..., -1:, :])
             labels.append(self.encode(target, recent, kind))
             tokens.append(self._noisy(labels[-1], kind, noise, drawn[..., step, :]) if noise else labels[-1])
             recent = self.advance(tokens[-1], recent, kind)

@@ -38,6 +38,7 @@ def log_items(
     tokenizer: MotionTokenizer,
     *,
     noise: float = 0.0,
+    recovery: float = 1.0,
     drawn: Sequence[Tensor] | None = None,
 ) -> list[Item]:
     """The logs of scenes, tokenized side by side: decision after decision costs the same for one scene and for many.
@@ -48,6 +49,7 @@ def log_items(
 
     Keyword Args:
         noise: of :meth:`~dpa.tokens.MotionTokenizer.encode_tracks`.
+        recovery: as there.
         drawn: ``[A, T, 3]`` for each scene, as there.
     """
 
@@ -56,7 +58,7 @@ def log_items(
 
     given = (padded(name) for name in ("logged", "logged_valid", "recent", "kind"))
     draws = pad_sequence(list(drawn), batch_first=True) if drawn is not None else None
-    tracks = tokenizer.encode_tracks(*given, noise=noise, drawn=draws)
+    tracks = tokenizer.encode_tracks(*given, noise=noise, recovery=recovery, drawn=draws)
     rows = zip(contexts, tracks.tokens, tracks.labels, tracks.valid, strict=True)
     return [_item(context, *(row[: len(context.kind)] for row in each)) for context, *each in rows]
 
@@ -95,6 +97,7 @@ class LogItems:
     Keyword Args:
         augment: drawn anew each time that a scene comes up.
         noise: share of tokens that are replaced, drawn anew as well.
+        recovery: share of the offset from the log that a label makes good after noise.
         max_agents: see :func:`choose_agents`.
         keep_gib: memory for what is kept, in each process that reads; once full, the rest is made anew each time.
 
@@ -116,11 +119,13 @@ class LogItems:
         *,
         augment: Augmentation = AS_LOGGED,
         noise: float = 0.0,
+        recovery: float = 1.0,
         max_agents: int,
         keep_gib: float = 0.0,
     ) -> None:
         self.scenes, self.tokenizer, self.options = scenes, tokenizer, options
-        self.augment, self.noise, self.max_agents = augment, noise, max_agents
+        self.augment, self.max_agents = augment, max_agents
+        self.noise, self.recovery = noise, recovery
         self.keep_gib = keep_gib
         self._kept: dict[tuple[int, bool], Item] = {}
         self._agents: dict[int, int] = {}
@@ -160,7 +165,8 @@ class LogItems:
         items = [_of_agents(logs.get(place, each.log), each.chosen) for place, each in enumerate(drawn)]
         if self.noise:
             noise = [each.noise for each in drawn]
-            items = log_items([item.context for item in items], self.tokenizer, noise=self.noise, drawn=noise)
+            contexts = [item.context for item in items]
+            items = log_items(contexts, self.tokenizer, noise=self.noise, recovery=self.recovery, drawn=noise)
         return with_tokens(items)
 
     def _context(self, index: int, scene: Scene | None, change: Change) -> SceneContext:

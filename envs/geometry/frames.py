@@ -64,3 +64,23 @@ def to_world(pose: Tensor, frame: Tensor) -> Tensor:
     """
     xy = rotate(pose[..., :2], frame[..., 2]) + frame[..., :2]
     return torch.cat((xy, wrap_angle(pose[..., 2:] + frame[..., 2:])), -1)
+
+
+def beside(path: Tensor, pose: Tensor, start: Tensor, share: float | Tensor) -> Tensor:
+    """A path moved aside: a share of the offset of a pose from the path's start stays, as seen along the path.
+
+    Args:
+        path: ``[..., F, 3]``.
+        pose: ``[..., 3]`` of who lies beside the path.
+        start: ``[..., 3]`` where the path comes from.
+        share: number or ``[..., 1]``; 0 is the path itself.
+
+    Returns:
+        ``[..., F, 3]``.
+
+    Examples:
+        >>> straight, aside = torch.tensor([[5.0, 0.0, 0.0]]), torch.tensor([0.0, 2.0, 0.0])
+        >>> beside(straight, aside, torch.zeros(3), share=0.75)
+        tensor([[5.0000, 1.5000, 0.0000]])
+    """
+    return to_world((share * to_local(pose, start))[..., None, :], path)

@@ -53,6 +53,7 @@ LIMITS: dict[str, Limit] = {
     **dict.fromkeys(("seed", "split_seed"), Limit(int)),
     **dict.fromkeys(("memory", "max_norm", "lr", "rms", "length", "piece_length", "temperature", "top_p"), POSITIVE),
     **dict.fromkeys(("noise", "dropout", "mirror", "agent_drop", "label_smoothing"), SHARE),
+    "pretraining.recovery": SHARE._replace(above=True),
     **dict.fromkeys(("weight_decay", "rotation", "keep_gib"), Limit(float, least=0)),
     **dict.fromkeys(("loss.alpha", "loss.cloning", "loss.conservative", "margin"), Limit(float)),
     **dict.fromkeys(("held_out", "solver.window"), Limit(float)),

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dpa.tokens import TokenizedTracks, VerletTokenizer
 from dpa.tokens.verlet import CHANGES, DEFAULT_BINS, DEFAULT_TURN, MAX_BIN
-from envs.geometry.frames import to_world, wrap_angle
+from envs.geometry.frames import to_local, to_world, wrap_angle
 from envs.scene import AgentKind
 from envs.sources.synthetic import straight_road
 
@@ -226,13 +226,14 @@ def test_tokens_are_valid_up_to_the_first_hole(missing: list[int], expected: int
 
 
 # --- noise ----------------------------------------------------------------------------------------------------------
-def noisy_tracks(noise: float, seed: int = 0) -> tuple[TokenizedTracks, TokenizedTracks]:
+def noisy_tracks(noise: float, seed: int = 0, recovery: float = 1.0) -> tuple[TokenizedTracks, TokenizedTracks]:
     """The same tracks with noise and without."""
     agents = straight_road(6, seed=1).agents
     given = (agents.poses[:, 11:], agents.valid[:, 11:], agents.recent(5), agents.kind)
     drawn = torch.rand(6, 16, 3, generator=torch.Generator().manual_seed(seed))
     tokenizer = VerletTokenizer()
-    return tokenizer.encode_tracks(*given, noise=noise, drawn=drawn), tokenizer.encode_tracks(*given)
+    noisy = tokenizer.encode_tracks(*given, noise=noise, recovery=recovery, drawn=drawn)
+    return noisy, tokenizer.encode_tracks(*given)
 
 
 def test_without_noise_the_labels_are_the_tokens() -> None:
@@ -257,6 +258,32 @@ def test_noise_replaces_tokens_by_neighbours_and_labels_lead_back_to_the_log() -
     agent, step = first[0].item(), first[1].item()
     assert torch.equal(noisy.tokens[agent, :step], plain.tokens[agent, :step])
     assert noisy.labels[agent, step] == plain.tokens[agent, step]
+
+
+def test_labels_that_come_back_slowly_aim_beside_the_log() -> None:
+    """By hand, for each decision: the target lies beside the log as the agent lies beside it, but nearer."""
+    noisy, _ = noisy_tracks(0.5, recovery=0.25)
+    agents, tokenizer = straight_road(6, seed=1).agents, VerletTokenizer()
+    logged, driven = agents.poses[:, 11:].unflatten(1, (16, 5)), noisy.poses.unflatten(1, (16, 5))
+    for step in range(1, 16):
+        recent = torch.cat(
+            ((driven[:, step - 2, -1:] if step > 1 else agents.recent(5)[:, -1:]), driven[:, step - 1]), 1
+        )
+        offset = 0.75 * to_local(driven[:, step - 1, -1], logged[:, step - 1, -1])
+        target = to_local(to_world(offset[:, None], logged[:, step]), recent[:, -1:])
+        assert torch.equal(noisy.labels[:, step], tokenizer.encode(target, recent, agents.kind))
+
+
+def test_labels_that_come_back_slowly_drive_more_smoothly_and_are_the_plain_ones_without_noise() -> None:
+    def change(tracks: TokenizedTracks) -> float:
+        """How far labels lie from unchanged velocity, in bins, in the mean."""
+        return float(
+            (torch.stack((tracks.labels // CHANGES, tracks.labels % CHANGES)) - CHANGES // 2).abs().float().mean()
+        )
+
+    (slow, plain), (fast, _) = noisy_tracks(0.5, recovery=0.25), noisy_tracks(0.5)
+    assert change(slow) < change(fast)
+    assert torch.equal(noisy_tracks(0.0, recovery=0.25)[0].labels, plain.labels)
 
 
 def test_noise_is_that_of_the_draws() -> None:
