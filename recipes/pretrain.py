@@ -124,7 +124,8 @@ def pretrain(
         train.load_state_dict(run.state["train"])
     batches = train.endless()
     with run:
-        if origin is not None and run.first_step == 0:
+        # Labels that lead back from noise are not the log's own: on clean logs the start would stay ahead.
+        if origin is not None and run.first_step == 0 and not options.noise:
             look(run, model, best, tune, device, ranks)
         for step in run.steps():
             items = next(batches)
