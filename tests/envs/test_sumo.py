@@ -46,7 +46,7 @@ shapely = pytest.importorskip("shapely", reason="needs the extra `sumo`")
 pytest.importorskip("sumolib", reason="needs the extra `sumo`")
 
 LANE_WIDTH = 3.2
-SMALL = {"windows": 2, "warmup": 15.0, "scenes_per_unit": 8}
+SMALL = {"windows": 2, "warmup": 15.0, "scenes_per_unit": 4}
 KINDS = [name for name in sumo.presets() if name != "mixed"]
 
 
@@ -56,7 +56,7 @@ KINDS = [name for name in sumo.presets() if name != "mixed"]
 @pytest.fixture(scope="module")
 def scenes() -> list[Scene]:
     """Scenes of every kind of network."""
-    return [scene for kind in KINDS for scene in sumo.generate(8, seed=11, preset=kind, **SMALL)]
+    return [scene for kind in KINDS for scene in sumo.generate(4, seed=11, preset=kind, **SMALL)]
 
 
 def boxes_of(scene: Scene) -> torch.Tensor:
@@ -133,7 +133,7 @@ def test_agents_to_predict_stay_to_the_end_and_are_of_several_kinds(scenes: list
 
 
 def test_scene_ids_are_unique(scenes: list[Scene]) -> None:
-    assert len({scene.scene_id for scene in scenes}) == len(scenes) == 48
+    assert len({scene.scene_id for scene in scenes}) == len(scenes) == 24
 
 
 def test_maps_are_small_and_whole(scenes: list[Scene]) -> None:

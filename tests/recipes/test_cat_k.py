@@ -29,7 +29,7 @@ def aligning(options: Callable, policy: Path, output: Path, *more: str) -> list[
 def test_it_learns_from_logs_and_tells_how_well_they_are_followed(
     run: Callable, options: Callable, origin: Path, tmp_path: Path
 ) -> None:
-    long = ("alignment.steps=40", "alignment.lr=3e-3")
+    long = ("alignment.steps=20", "alignment.lr=6e-3")
     outcome = run("align", *aligning(options, origin, tmp_path, *long))
     assert outcome.status == 0, outcome.err
     losses = [value for _, value in read_curve(tmp_path, "train/loss_next_token")]

@@ -73,8 +73,9 @@ def masked_problems(number: int, count: int) -> Iterator[tuple[Tensor, Tensor, T
         yield x, y, x_valid, y_valid
 
 
-def test_exact_equals_pot_on_ten_thousand_masked_problems() -> None:
-    batches, count, kinds = 200, 50, set()
+@pytest.mark.parametrize("batches", [40, pytest.param(200, marks=pytest.mark.slow)])
+def test_exact_equals_pot_on_thousands_of_masked_problems(batches: int) -> None:
+    count, kinds = 50, set()
     for seed, (x, y, x_valid, y_valid) in enumerate(masked_problems(batches, count)):
         want = np.array([oracle(x[i][x_valid[i]], y[i][y_valid[i]]) for i in range(count)])
         got = transport_cost(x, y, x_valid, y_valid, WEIGHTS)
@@ -88,7 +89,7 @@ def test_exact_equals_pot_on_ten_thousand_masked_problems() -> None:
             single = transport_cost(x.float(), y.float(), x_valid, y_valid, WEIGHTS)
             assert single.distance.dtype == single.parts.dtype == torch.float32
             np.testing.assert_allclose(single.distance.numpy(), want, rtol=1e-5, atol=1e-7)
-    assert batches * count == 10_000 and kinds == {"equal", "unequal", "single", "empty"}
+    assert kinds == {"equal", "unequal", "single", "empty"}
 
 
 def test_one_feature_gives_the_wasserstein_distance_of_scipy() -> None:
