@@ -260,7 +260,7 @@ def test_a_sight_of_nothing_is_refused() -> None:
 
 # --- with other libraries -------------------------------------------------------------------------------------------
 @pytest.mark.filterwarnings("default")  # what other libraries warn of is theirs
-@pytest.mark.parametrize("control", ["sdc", "all"])
+@pytest.mark.parametrize("control", [pytest.param("sdc", marks=pytest.mark.slow), "all"])
 def test_stable_baselines_trains(control: str) -> None:
     sb3 = pytest.importorskip("stable_baselines3")
     env = make(control=control, horizon=8)

@@ -23,7 +23,7 @@ from tests.fuzz.judge import judge
 from tests.fuzz.pen import MOST_MEMORY, run_apart
 
 NEEDS = {"argoverse": ("pyarrow", "shapely")}
-INPUTS = 200
+INPUTS = 80
 
 
 def corpus_of(name: str) -> Corpus:

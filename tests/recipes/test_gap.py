@@ -152,6 +152,7 @@ def test_policies_with_different_tokens_are_refused(
     assert outcome.status == 2 and "linear has other tokens than the first policy" in outcome.err
 
 
+@pytest.mark.slow
 def test_rows_of_several_policies_are_named_by_them(
     run: Callable, options: Callable, policies: list[Path], tmp_path: Path
 ) -> None:

@@ -59,7 +59,13 @@ def assert_refused(outcome: tuple, *words: str) -> None:
 
 # --- what it draws --------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
-    "more", [(), ("rollout=best",), ("rollout=2", "agent=0"), ("agent=id:1",), ("figure=rollouts", "each=2")]
+    "more",
+    [
+        (),
+        ("rollout=2", "agent=0"),
+        ("figure=rollouts", "each=2"),
+        *(pytest.param((option,), marks=pytest.mark.slow) for option in ("rollout=best", "agent=id:1")),
+    ],
 )
 def test_a_figure_is_written(look: Callable, tmp_path: Path, more: tuple[str, ...]) -> None:
     outcome = look(*more)

@@ -217,7 +217,7 @@ def test_an_experiment_that_cannot_work_is_refused_before_any_work(options: tupl
         check_experiment(configuration(*options))
 
 
-@pytest.mark.parametrize("config", ["demo", "study"])
+@pytest.mark.parametrize("config", ["demo", pytest.param("study", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", [name for name in EXPERIMENTS if name != "base"])
 def test_what_the_page_of_the_demo_or_of_a_study_offers_fits_it(name: str, config: str) -> None:
     with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):

@@ -5,11 +5,9 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import json
-import os
 import re
 import shutil
 import sys
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -628,7 +626,10 @@ def test_scenes_that_no_loss_sees_are_looked_at_along_the_way(
     assert not torch.equal(last, weights(tmp_path / "omf/step_2/policy.pt"))
 
 
-@pytest.mark.parametrize(("method", "rank_by"), [("sft_best_oa", "distance"), ("sft_best_ade", "ade")])
+@pytest.mark.parametrize(
+    ("method", "rank_by"),
+    [("sft_best_oa", "distance"), pytest.param("sft_best_ade", "ade", marks=pytest.mark.slow)],
+)
 def test_imitation_logs_how_likely_near_and_far_rollouts_of_its_own_scenes_are(
     run: Callable, options: Callable, runs: Path, tmp_path: Path, method: str, rank_by: str
 ) -> None:
@@ -1117,68 +1118,6 @@ def test_a_scene_to_play_that_is_not_there_is_told(
     outcome = run("play", *options("play", f"policies={policy}", "show=[nowhere]", f"output={page}"))
     assert outcome.status == 2 and "no scene 'nowhere'" in outcome.err
     assert not page.exists()
-
-
-# --- jobs -----------------------------------------------------------------------------------------------------------
-def test_jobs_run_here_one_after_the_other() -> None:
-    ran: list[int] = []
-    with Workers(1, threads=1) as workers:
-        ended = list(workers.run([Job(ran.append, (number,), f"job {number}") for number in range(3)], "jobs"))
-    assert ran == [0, 1, 2]
-    assert [name for name, *_ in ended] == ["job 0", "job 1", "job 2"] and all(seconds >= 0 for _, seconds, _ in ended)
-
-
-def test_the_error_of_a_job_is_the_error_of_all_and_the_workers_go_on() -> None:
-    with Workers(2, threads=1) as workers:
-        with pytest.raises(ValueError, match="Expecting property name"):
-            list(workers.run([Job(json.loads, ("{",), "bad")], "jobs"))
-        ((name, _, result),) = workers.run([Job(json.loads, ("{}",), "good")], "jobs")
-        assert (name, result) == ("good", {})
-
-
-def test_jobs_under_way_beside_one_that_fails_are_not_lost_and_no_other_is_begun(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    bad, slow = Job(json.loads, ("{",), "bad"), Job(time.sleep, (2,), "slow")
-    (made := tmp_path / "made").mkdir()
-    later = [Job(os.mkdir, (str(made / str(number)),), str(number)) for number in range(20)]
-    ended = []
-    with Workers(2, threads=1) as workers:
-        list(workers.run([Job(time.sleep, (0,), "start")] * 4, "warm"))
-        with pytest.raises(ValueError, match="Expecting property name"):
-            ended += (name for name, *_ in workers.run([slow, bad, *later], "jobs"))
-    assert ended == ["slow"] and not list(made.iterdir())
-    assert "bad: Expecting property name" in capsys.readouterr().err, "told at once"
-
-
-def test_workers_that_are_told_to_stop_begin_no_job(tmp_path: Path) -> None:
-    slow = Job(time.sleep, (1,), "slow")
-    (made := tmp_path / "made").mkdir()
-    later = [Job(os.mkdir, (str(made / str(number)),), str(number)) for number in range(20)]
-    with Workers(2, threads=1) as workers:
-        next(workers.run([slow, slow, *later], "jobs"))
-    assert len(list(made.iterdir())) <= 1
-
-
-@pytest.mark.slow
-def test_workers_share_the_gpus_that_the_command_may_use(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
-    seen = []
-    for spread in (True, False):
-        with Workers(2, threads=1, spread=spread) as workers:
-            jobs = [Job(os.getenv, ("CUDA_VISIBLE_DEVICES",), str(number)) for number in range(8)]
-            seen.append({result for _, _, result in workers.run(jobs, "jobs")})
-    assert seen[0] and seen[0] <= {"3", "5"} and seen[1] == {"3,5"}
-
-
-def test_a_killed_worker_is_told_with_what_to_do() -> None:
-    with Workers(2, threads=1) as workers, pytest.raises(ChildProcessError, match="'jobs' was killed.*workers=1"):
-        list(workers.run([Job(os._exit, (1,), "dies")], "jobs"))
-
-
-def test_a_number_of_workers_that_is_not_positive_is_refused() -> None:
-    with pytest.raises(ValueError, match="workers must be 1 or more, got 0"):
-        Workers(0, threads=1)
 
 
 if __name__ == "__main__":

@@ -224,6 +224,7 @@ def test_more_rollouts_make_wider_pairs() -> None:
     assert rows[8]["margin"].mean == pytest.approx((order[-2:].mean() - order[:2].mean()) / np.mean(values))
 
 
+@pytest.mark.slow
 def test_sensitivity_ranks_the_same_rollouts_by_every_variant(
     run: Callable, options: Callable, policies: str, tmp_path: Path
 ) -> None:

@@ -565,8 +565,8 @@ def test_a_study_of_rankings_alone_makes_a_page_without_a_claim(copied: Path, tm
     ("name", "lacking", "told"),
     [
         ("validity", "rankings", "lacks 'rankings'"),
-        ("sensitivity", "made", "lacks 'made'"),
-        ("discriminator", "jerk_minus_distance", "lacks 'jerk_minus_distance'"),
+        pytest.param("sensitivity", "made", "lacks 'made'", marks=pytest.mark.slow),
+        pytest.param("discriminator", "jerk_minus_distance", "lacks 'jerk_minus_distance'", marks=pytest.mark.slow),
     ],
 )
 def test_a_summary_that_lacks_an_entry_is_refused_with_its_file_and_recipe(
