@@ -6,8 +6,6 @@ from pathlib import Path
 
 from envs.card import Card, card_text
 from envs.files import write_bytes
-from envs.render.card import draw_card
-from envs.render.save import save_picture
 from envs.shards import read_record
 from envs.store import Manifest, SceneStore
 
@@ -21,6 +19,9 @@ def write_card(folder: Path, manifest: Manifest) -> None:
         folder: of the store.
         manifest: of the store, complete.
     """
+    from envs.render.card import draw_card  # matplotlib takes a second to import, and every recipe may convert scenes
+    from envs.render.save import save_picture
+
     card = Card()
     for shard in manifest.shards:
         card.merge(read_record(folder / shard["name"]).card)
