@@ -8,12 +8,13 @@ and it drives among agents of the same policy. What grows from one row to the ne
 one thing: replayed agents show the policy where they are, and no tokens, which it has hardly seen in training. Only
 agents whose log goes on to the end are looked at, so that nobody runs into one that is no longer there.
 
-Run the same command again to go on after a kill: rows that are there are read back.
+Of several policies each is also told minus the first, scene by scene. Run the same command again to go on after a
+kill: rows that are there are read back.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -29,7 +30,7 @@ from dpa.policy.sampling import draw
 from dpa.realism import RealismConfig
 from dpa.realism.features import measure
 from dpa.realism.tracks import compare
-from dpa.report.statistics import summary
+from dpa.report.statistics import Interval, summary
 from dpa.rollout import lifted
 from dpa.tokens import MotionTokenizer
 from envs.files import write_json
@@ -47,6 +48,8 @@ from recipes.studies.tables import StudyTable, tell
 
 Rolls = Iterator[tuple[int, Tensor]]
 """Index of a scene and its trajectories ``[R, A, 80, 4]``."""
+PLACES = ("single decisions", "alone", "among its own")
+"""Where a policy is looked at."""
 SECONDS = (2.0, 8.0)
 """When it is looked at what has happened so far."""
 
@@ -105,11 +108,12 @@ def rows(cfg: DictConfig) -> Iterator[tuple[str, dict[str, Any], Callable[[Scene
     for name, (model, options, config) in policies.items():
         own = told | {"policy": weights_digest(model), **config}
         alone, among = replace(options, control="sdc"), replace(options, control="all")
-        for row, roll in (
-            ("single decisions", lambda s, m=model, o=options: single_decisions(s, m, o, decoding, cfg)),
-            ("alone", lambda s, m=model, o=alone: driven(s, m, o, cfg)),
-            ("among its own", lambda s, m=model, o=among: driven(s, m, o, cfg)),
-        ):
+        rolls = (
+            lambda s, m=model, o=options: single_decisions(s, m, o, decoding, cfg),
+            lambda s, m=model, o=alone: driven(s, m, o, cfg),
+            lambda s, m=model, o=among: driven(s, m, o, cfg),
+        )
+        for row, roll in zip(PLACES, rolls, strict=True):
             yield f"{name}: {row}" if several else row, own, roll
 
 
@@ -192,21 +196,37 @@ def measure_gap(cfg: DictConfig, scenes: SceneSource) -> dict[str, dict[str, lis
     return gap
 
 
-def table(gap: dict[str, dict[str, list[float | None]]], num_scenes: int) -> StudyTable:
-    """Every row's figures with intervals over scenes, each over those in which the log is still there."""
+def tables(gap: dict[str, dict[str, list[float | None]]], names: Sequence[str], num_scenes: int) -> list[StudyTable]:
+    """Every row with intervals over scenes, and each further policy minus the first, scene by scene.
+
+    Args:
+        gap: of :func:`measure_gap`; a figure counts the scenes in which the log is still there.
+        names: of the policies.
+        num_scenes: of all.
+    """
     columns = list(next(iter(gap.values())))
-    rows = {
-        name: [
-            summary([[value for value in figures[column] if value is not None]])
-            if any(value is not None for value in figures[column])
-            else None
-            for column in columns
-        ]
-        for name, figures in gap.items()
-    }
-    return StudyTable(
-        "gap", f"the self-driving car in {num_scenes} scenes", ["driven by", *columns], rows, signed=False
-    )
+    rows = {name: [_mean(figures[column]) for column in columns] for name, figures in gap.items()}
+    title = f"the self-driving car in {num_scenes} scenes"
+    found = [StudyTable("gap", title, ["driven by", *columns], rows, signed=False)]
+    first, *others = names
+    if others:
+        pairs = {f"{name}: {place}": f"{first}: {place}" for name in others for place in PLACES}
+        rows = {
+            row: [_mean(_minus(gap[row][column], gap[of_first][column])) for column in columns]
+            for row, of_first in pairs.items()
+        }
+        found.append(StudyTable("gap_difference", f"minus {first}, scene by scene", ["driven by", *columns], rows))
+    return found
+
+
+def _minus(values: list[float | None], others: list[float | None]) -> list[float | None]:
+    """Of the same scenes, in both of which the log is still there or has left."""
+    return [None if one is None else one - other for one, other in zip(values, others, strict=True)]
+
+
+def _mean(values: list[float | None]) -> Interval | None:
+    known = [value for value in values if value is not None]
+    return summary([known]) if known else None
 
 
 @hydra.main(**CONFIG, config_name="gap")
@@ -215,7 +235,7 @@ def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.gap``."""
     scenes = open_splits(cfg.scenes)[cfg.split]
     gap = measure_gap(cfg, scenes)
-    tell(cfg, [table(gap, len(scenes))], {})
+    tell(cfg, tables(gap, list(policies_of(cfg)), len(scenes)), {})
     if cfg.json is not None:
         write_json(cfg.json, {"scenes": len(scenes), "rows": gap})
 

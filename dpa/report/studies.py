@@ -12,6 +12,9 @@ from matplotlib.axes import Axes
 from dpa.report.canvas import CYCLE, INK, QUIET, blank_figure, calm, save_figure
 from dpa.report.statistics import Interval
 
+MARKERS = "os^D"
+"""The next one where colours come round again."""
+
 
 def plot_validity(found: Mapping[str, Mapping[str, Any]], path: str | Path) -> None:
     """Draw realism against mean distance, window by window, for each ranking (figure 3 of the paper).
@@ -58,12 +61,13 @@ def plot_references(
     """
     figure = blank_figure(10, 4)
     left, right = figure.subplots(1, 2, width_ratios=[1.5, 1])
-    for color, (name, curve) in zip(_colours(len(curves)), curves.items(), strict=True):
+    for place, (color, (name, curve)) in enumerate(zip(_colours(len(curves)), curves.items(), strict=True)):
+        marker = MARKERS[place // len(CYCLE) % len(MARKERS)]
         steps, nll = zip(*(row for row in curve if row[0]), strict=True)
-        left.plot(steps, nll, "o-", color=color, ms=3, lw=1.4, label=name)
+        left.plot(steps, nll, marker, ls="-", color=color, ms=3, lw=1.4, label=name)
         if (value := realism[name]) is not None:
             right.plot([min(nll)] * 2, [value.low, value.high], color=color, lw=1.4, alpha=0.5)
-            right.plot(min(nll), value.mean, "o", color=color, ms=6, mec="white", mew=1)
+            right.plot(min(nll), value.mean, marker, color=color, ms=6, mec="white", mew=1)
     left.set_xscale("log")
     left.set_xlabel("step", fontsize=8, color=INK)
     left.set_title("NLL of the tuning scenes, per token [nats]")

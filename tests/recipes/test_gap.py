@@ -20,7 +20,7 @@ from envs.scene import CURRENT_STEP, MapKind, Scene
 from envs.sources.synthetic import build_scene, straight_road
 from recipes.common.cli import CONFIG
 from recipes.common.models import build_policy, policy_config, write_policy
-from recipes.gap import logs, look, single_decisions
+from recipes.gap import PLACES, logs, look, single_decisions, tables
 
 METRIC = RealismConfig.load("2024")
 
@@ -111,6 +111,18 @@ def test_errors_of_single_decisions_do_not_add_up() -> None:
     _, tokens, decided = rows(two_cars(), Stops)
     ends = (tokens - decided)[0, 4::5, 0]
     torch.testing.assert_close(ends, torch.full((16,), 6 * 0.28125), atol=0.282, rtol=0)
+
+
+def test_a_further_policy_is_told_minus_the_first_scene_by_scene() -> None:
+    """By hand; where the log of a scene has left, it counts in neither."""
+    gap = {f"one: {place}": {"collision": [0.5, 0.25, None]} for place in PLACES}
+    gap |= {f"two: {place}": {"collision": [0.25, 0.5, None]} for place in PLACES}
+    gap["two: alone"] = {"collision": [0.0, 0.0, None]}
+    values, minus = tables(gap, ["one", "two"], 3)
+    assert values.rows["one: alone"][0].mean == 0.375 and values.rows["one: alone"][0].num_scenes == 2
+    found = {name: cells[0].mean for name, cells in minus.rows.items()}
+    assert found == {"two: single decisions": 0.0, "two: alone": -0.375, "two: among its own": 0.0}
+    assert len(tables({"log": {"collision": [0.0]}}, ["one"], 1)) == 1, "one policy has nothing to be set against"
 
 
 @pytest.fixture(scope="module")
