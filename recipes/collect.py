@@ -17,7 +17,7 @@ import hydra
 from omegaconf import DictConfig
 
 from dpa.policy import Decoding
-from dpa.policy.actor import check_precision
+from dpa.policy.precision import check_precision
 from dpa.preferences import PreferenceStore, PreferenceWriter, Provenance, data_card
 from dpa.ranking import Distance
 from dpa.ranking.transform import RankRollouts

@@ -103,7 +103,7 @@ def pretrain(
     best = copy.deepcopy(model)
     train = training_items(cfg, splits.train, model, seed, ranks)
     tune = tuning_items(cfg, splits.tune, model, ranks)
-    loss = NextTokenLoss(token_network(model), label_smoothing=options.label_smoothing)
+    loss = NextTokenLoss(token_network(model, options.precision), label_smoothing=options.label_smoothing)
     loss.set_keys(labels=keys.LABELS)
     loss = ranks.wrap(loss)
     optimizer = make_optimizer(model, options.lr, options.weight_decay, kind=options.optimizer, rms=options.rms)

@@ -11,20 +11,39 @@ from tensordict.nn import TensorDictModule, TensorDictParams
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
+from dpa.policy.precision import Precision, check_precision, running_in
+
 CONTEXT = "context"
 LOGITS = "logits"
 
 
-def token_network(model: nn.Module) -> TensorDictModule:
+class _Rounded(nn.Module):
+    """A model whose linear layers run in another precision; its logits are float32 again."""
+
+    def __init__(self, model: nn.Module, precision: Precision) -> None:
+        super().__init__()
+        self.model, self.precision = model, precision
+
+    def forward(self, context: TensorDictBase, tokens: Tensor, token_valid: Tensor) -> Tensor:
+        with running_in(self.precision, tokens.device):
+            return self.model(context, tokens, token_valid).float()
+
+
+def token_network(model: nn.Module, precision: Precision = "float32") -> TensorDictModule:
     """Wrap a model as the network of a loss.
 
     Args:
         model: called with a context of batch size ``[S]``, tokens ``[S, M, A, T]`` and their validity
             ``[S, M or 1, A, T]``; gives logits ``[S, M, A, T, V]`` (:class:`~dpa.policy.MotionLM` does).
+        precision: of its linear layers; weights, gradients and logits are float32 all the same.
 
     Returns:
         The network, in training or evaluation mode as the model is.
+
+    Raises:
+        ValueError: an unknown precision.
     """
+    model = model if check_precision(precision) == "float32" else _Rounded(model, precision).train(model.training)
     network = TensorDictModule(model, in_keys=[CONTEXT, "tokens", "token_valid"], out_keys=[LOGITS])
     return network.train(model.training)
 

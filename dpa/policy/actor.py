@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import Literal, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -14,22 +13,10 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from dpa.policy.context import AGENT_FIELDS, ContextOptions, SceneContext, collate_contexts, make_context
 from dpa.policy.decoder import NodeCache, NodeInputs, SceneMemory
 from dpa.policy.motionlm import MotionLM
+from dpa.policy.precision import Precision, check_precision, running_in
 from dpa.policy.sampling import Decoding, draw, rollout_noise
 from envs import keys
 from envs.scene import SceneSource
-
-Precision = Literal["float32", "bfloat16"]
-
-
-def check_precision(precision: str) -> Precision:
-    """Give the precision back.
-
-    Raises:
-        ValueError: it is none that a policy runs in.
-    """
-    if precision not in get_args(Precision):
-        raise ValueError(f"precision must be one of {', '.join(get_args(Precision))}, got {precision!r}.")
-    return precision
 
 
 class Contexts:
@@ -163,16 +150,13 @@ class MotionActor(TensorDictModuleBase):
         valid = tensordict[keys.VALID]
         masks = self._cache.start(step, valid)
         nodes = NodeInputs(recent, last, step[:, None].expand_as(last), tensordict[keys.KIND], valid)
-        with self._autocast(recent.device):
+        with running_in(self.precision, recent.device):
             return self._decode(nodes, self._memory, masks, self._cache)
 
     def set_seed(self, seed: int) -> None:
         """Seed the sampling anew: the rollouts that begin from now on are the first ones of this seed."""
         self.seed = seed
         self._begun: dict[tuple[int, int], int] = {}
-
-    def _autocast(self, device: torch.device) -> torch.autocast:
-        return torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
 
     # --- the start of episodes --------------------------------------------------------------------------------------
     def _start(self, tensordict: TensorDictBase) -> None:
@@ -197,7 +181,7 @@ class MotionActor(TensorDictModuleBase):
         context = pad_context(context, shape[1])
         self._check_agents(context, tensordict, step == 0)
         self._context = context
-        with self._autocast(step.device):
+        with running_in(self.precision, step.device):
             self._memory = self.model.encode(context)
         self._draw_noise(begins.nonzero()[:, 0].tolist(), scene.tolist())
 

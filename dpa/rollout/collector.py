@@ -13,9 +13,9 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.collectors import BaseCollector
 
-from dpa.policy.actor import Precision
 from dpa.policy.context import ContextOptions
 from dpa.policy.motionlm import MotionLM
+from dpa.policy.precision import Precision
 from dpa.policy.sampling import Decoding
 from dpa.rollout.crew import Crew, Outcome, Workers, hire
 from dpa.rollout.job import PostProcess, RolloutJob

@@ -12,9 +12,10 @@ from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 
-from dpa.policy.actor import Contexts, MotionActor, Precision, check_precision
+from dpa.policy.actor import Contexts, MotionActor
 from dpa.policy.context import ContextOptions
 from dpa.policy.motionlm import MotionLM
+from dpa.policy.precision import Precision, check_precision
 from dpa.policy.sampling import Decoding
 from dpa.rollout.plan import RolloutTask
 from dpa.tokens import TokenAction

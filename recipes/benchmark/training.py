@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from dpa.policy import SIZES
+from dpa.policy.precision import PRECISIONS
 from dpa.report.curves import read_curves
 from dpa.training.run import SECONDS
 from envs.progress import progress
@@ -38,18 +39,23 @@ class Case:
         size: of the model.
         processes: that share a batch, started by torchrun.
         threads: of torch in each.
+        precision: of linear layers; None leaves it to the checkout, which may not know the option.
     """
 
     checkout: Path
     size: str
     processes: int
     threads: int
+    precision: str | None
 
 
 def add_options(part: argparse.ArgumentParser) -> None:
     """Options of ``python -m recipes.benchmark training``."""
     part.add_argument(
         "--size", nargs="+", choices=sorted(SIZES), default=["nano", "paper"], help="of the model (default: both)"
+    )
+    part.add_argument(
+        "--precision", nargs="+", choices=PRECISIONS, help="of linear layers, here (default: that of the recipe)"
     )
     part.add_argument("--against", metavar="DIR", help="another checkout of the project, measured in turn")
     part.add_argument("--agents", type=int, default=24, help="of a scene at most (default: %(default)s)")
@@ -75,12 +81,16 @@ def measure(options: dict[str, Any]) -> list[dict[str, Any]]:
     for name, least in (("agents", 1), ("pieces", 1), ("cores", 1), ("scenes", BATCH), ("epochs", 2), ("repeats", 1)):
         if options[name] < least:
             raise ValueError(f"--{name} must be {least} or more, got {options[name]}.")
-    checkouts = [HERE, *([Path(options["against"]).absolute()] if options["against"] else [])]
-    for checkout in checkouts:
+    here = [(HERE, precision) for precision in options["precision"] or [None]]
+    checkouts = [*here, *([(Path(options["against"]).absolute(), None)] if options["against"] else [])]
+    for checkout, _ in checkouts:
         if not (checkout / "recipes/pretrain.py").is_file():
             raise ValueError(f"--against={checkout} holds no recipes/pretrain.py; name the folder of a checkout.")
     ways = {(1, options["cores"]), (options["cores"], 1)}
-    cases = [Case(checkout, size, *way) for size, way, checkout in product(options["size"], sorted(ways), checkouts)]
+    cases = [
+        Case(checkout, size, *way, precision)
+        for size, way, (checkout, precision) in product(options["size"], sorted(ways), checkouts)
+    ]
     with tempfile.TemporaryDirectory() as temporary:
         scenes = Path(options["folder"] or temporary, "scenes").absolute()
         speeds: list[list[dict[str, float]]] = [[] for _ in cases]
@@ -111,6 +121,7 @@ def run(case: Case, options: dict[str, Any], scenes: Path, output: Path) -> dict
         f"scenes.cache={scenes}",
         f"threads={case.threads}",
         f"output={output}",
+        *([] if case.precision is None else [f"pretraining.precision={case.precision}"]),
     ]
     several = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={case.processes}"]
     command = [sys.executable, *(several if case.processes > 1 else []), "-m", "recipes.pretrain", *arguments]
@@ -133,9 +144,13 @@ def _row(case: Case, runs: list[dict[str, float]]) -> dict[str, Any]:
 
 
 def _print(rows: list[dict[str, Any]]) -> None:
-    table = Table("model", "processes x threads", "checkout", "first visit", "later", title="pre-training, scenes/s")
+    table = Table(
+        "model", "processes x threads", "checkout", "precision", "first visit", "later", title="pre-training, scenes/s"
+    )
     for row in rows:
         speeds = row["scenes_per_second"]
         way, where = f"{row['processes']} x {row['threads']}", Path(row["checkout"]).name
-        table.add_row(row["size"], way, where, f"{speeds['first']:.1f}", f"{speeds['later']:.1f}")
+        table.add_row(
+            row["size"], way, where, row["precision"] or "", f"{speeds['first']:.1f}", f"{speeds['later']:.1f}"
+        )
     Console(markup=False, width=110).print(table)

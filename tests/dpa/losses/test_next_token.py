@@ -8,7 +8,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dpa.losses import NextTokenLoss
+from dpa.losses import NextTokenLoss, token_network
+from dpa.policy import MotionLM, collate_contexts, make_context
+from dpa.tokens import VerletTokenizer
+from envs.sources.synthetic import straight_road
 
 VALID = [(0, 0), (0, 1), (0, 2), (1, 0)]
 
@@ -116,3 +119,43 @@ def test_a_smoothing_outside_its_range_is_refused(network: tuple, smoothing: flo
 
 if __name__ == "__main__":
     pytest.main([__file__])
+
+
+# --- linear layers in bfloat16 --------------------------------------------------------------------------------------
+@pytest.fixture
+def road() -> TensorDict:
+    """One scene with random tokens."""
+    return TensorDict(
+        {
+            "context": collate_contexts([make_context(straight_road(3))]),
+            "tokens": torch.randint(169, (1, 2, 3, 16), generator=torch.Generator().manual_seed(0)),
+            "token_valid": torch.ones(1, 1, 3, 16, dtype=torch.bool),
+        },
+        batch_size=[1],
+    )
+
+
+def learnt(model: MotionLM, road: TensorDict, precision: str) -> tuple[float, torch.Tensor]:
+    """The loss, and all gradients in one row."""
+    model.zero_grad()
+    loss = NextTokenLoss(token_network(model, precision))(road)["loss_next_token"]
+    loss.backward()
+    return loss.item(), torch.cat([p.grad.flatten() for p in model.parameters() if p.grad is not None])
+
+
+def test_bfloat16_layers_give_nearly_the_same_loss_and_gradients_in_float32(road: TensorDict) -> None:
+    torch.manual_seed(0)
+    model = MotionLM("nano", VerletTokenizer())
+    (exact, gradients), (rounded, others) = (learnt(model, road, precision) for precision in ("float32", "bfloat16"))
+    assert exact != rounded == pytest.approx(exact, rel=1e-3)
+    assert others.dtype == torch.float32
+    assert torch.nn.functional.cosine_similarity(gradients, others, dim=0) > 0.999
+
+
+def test_the_logits_of_bfloat16_layers_are_float32(road: TensorDict) -> None:
+    assert token_network(MotionLM("nano", VerletTokenizer()), "bfloat16")(road)["logits"].dtype == torch.float32
+
+
+def test_an_unknown_precision_is_refused() -> None:
+    with pytest.raises(ValueError, match="precision must be one of float32, bfloat16, got 'float8'"):
+        token_network(MotionLM("nano", VerletTokenizer()), "float8")
