@@ -146,7 +146,8 @@ def pretrain(
             "made_by": made_by,
         }
         write_policy(path, best, config, made)
-        write_json(result, {"options": decided_by, "policy": str(path), "tune_nll": run.state["best_nll"]})
+        told = {"policy": str(path), "num_scenes": len(splits.train), "tune_nll": run.state["best_nll"]}
+        write_json(result, {"options": decided_by} | told)
     ranks.wait()
     return path
 

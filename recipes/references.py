@@ -36,7 +36,7 @@ FIGURES = {
     "wrong_way": "wrong way",
 }
 """Figures of the table beside realism, means over scenes, and their titles."""
-COLUMNS = ["parameters [M]", "1,000 steps", "rate", "hours", "tuning NLL", "realism", *FIGURES.values()]
+COLUMNS = ["parameters [M]", "1,000 scenes", "1,000 steps", "rate", "hours", "tuning NLL", "realism", *FIGURES.values()]
 
 
 def measured(policy: Path, result: dict[str, Any], parameters: int) -> list[Cell]:
@@ -51,9 +51,11 @@ def measured(policy: Path, result: dict[str, Any], parameters: int) -> list[Cell
         OSError: the folder has no result or no curves of a pre-training.
     """
     realism = [value for value in result["per_scene"]["realism"] if value is not None]
-    training = read_json(policy.parent / "result.json")["options"]["pretraining"]
+    told = read_json(policy.parent / "result.json")
+    training, scenes = told["options"]["pretraining"], told.get("num_scenes")  # earlier trainings did not say
     return [
         parameters / 1e6,
+        None if scenes is None else scenes / 1e3,
         training["steps"] / 1e3,
         training["lr"],
         seconds_trained(policy.parent) / 3600,

@@ -32,8 +32,8 @@ def test_every_training_has_a_row_and_a_curve_and_is_scored_once(
     rows = {line.split("│")[1].strip(): line.split("│")[2:-1] for line in outcome.out.splitlines() if "│" in line}
     assert rows.keys() == {"long", "short"}
     for name, steps in (("short", 3), ("long", 6)):
-        parameters, seen, _, _, nll, *_ = (cell.split()[0] for cell in rows[name])
-        assert (float(seen), float(parameters)) == (steps / 1000, 0.153)
+        parameters, scenes, seen, _, _, nll, *_ = (cell.split()[0] for cell in rows[name])
+        assert (float(seen), float(parameters), float(scenes)) == (steps / 1000, 0.153, 0.006)
         lowest = min(value for _, value in read_curve(trained / name, "tune/nll"))
         assert float(nll) == pytest.approx(lowest, abs=5e-4)
     assert imread(tmp_path / "references.png").ndim == 3
