@@ -17,7 +17,6 @@ import hydra
 from omegaconf import DictConfig
 
 from dpa.policy import Decoding
-from dpa.policy.precision import check_precision
 from dpa.preferences import PreferenceStore, PreferenceWriter, Provenance, data_card
 from dpa.ranking import Distance
 from dpa.ranking.transform import RankRollouts
@@ -106,7 +105,6 @@ def check_collection(options: DictConfig) -> tuple[Decoding, Workers]:
     """
     decoding = build(Decoding, options.decoding, "collection.decoding")
     workers = build(Workers, options.workers, "collection.workers")
-    check_precision(options.precision)
     if options.num_rollouts < 1:
         raise ValueError(f"collection.num_rollouts must be 1 or more, got {options.num_rollouts}.")
     return decoding, workers

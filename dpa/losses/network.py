@@ -43,8 +43,8 @@ def token_network(model: nn.Module, precision: Precision = "float32") -> TensorD
     Raises:
         ValueError: an unknown precision.
     """
-    model = model if check_precision(precision) == "float32" else _Rounded(model, precision).train(model.training)
-    network = TensorDictModule(model, in_keys=[CONTEXT, "tokens", "token_valid"], out_keys=[LOGITS])
+    rounded = model if check_precision(precision) == "float32" else _Rounded(model, precision)
+    network = TensorDictModule(rounded, in_keys=[CONTEXT, "tokens", "token_valid"], out_keys=[LOGITS])
     return network.train(model.training)
 
 

@@ -66,7 +66,7 @@ LIMITS: dict[str, Limit] = {
     "grid": Limit(float, many=True),
     "start": Limit(str, empty=True),
     "optimizer": Limit(str, among=OPTIMIZERS),
-    "pretraining.precision": Limit(str, among=PRECISIONS),
+    "precision": Limit(str, among=PRECISIONS),
     "has_lights": FLAG._replace(empty=True),
     "rankings_per_scene": Limit(float, empty=True),
     "collection.workers": Limit(dict),
