@@ -13,7 +13,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-import torch
 
 from dpa.training.checkpoint import load_policy
 from dpa.training.loggers import read_curve
@@ -24,6 +23,8 @@ SECONDS = 240
 """Longer than any of these takes; ranks that wait for each other end in an error."""
 TOLERANCE = 1e-4
 """Of a loss, between numbers of ranks: sums in another order differ in their last bits."""
+WEIGHTS = 2e-2
+"""Likewise of a tensor, relative to its norm: of a gradient that is little but rounding AdamW makes whole steps."""
 ALIGNMENT = ("train/loss_preference", "train/logit_std", "train/nll_preferred", "train/entropy", "train/kl")
 CURVES = {
     "pretrain": ("train/loss_next_token", "train/accuracy", "train/entropy", "tune/nll", "tune/nll_moving"),
@@ -95,7 +96,7 @@ def assert_same(mine: Path, other: Path, curves: tuple[str, ...]) -> None:
     assert max(differences.values()) < TOLERANCE, differences
     ours, theirs = (load_policy(folder / "policy.pt")[0] for folder in (mine, other))
     for name, value in ours.items():
-        torch.testing.assert_close(value, theirs[name], atol=1e-3, rtol=1e-3)
+        assert (value - theirs[name]).norm() <= WEIGHTS * theirs[name].norm(), name
     assert not [path for path in mine.rglob("*") if path.name.startswith(PARTIAL_PREFIX)]
     options = [json.loads((folder / "result.json").read_text())["options"] for folder in (mine, other)]
     assert options[0] == options[1], "the number of ranks is no option of the run"
