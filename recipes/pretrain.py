@@ -107,7 +107,7 @@ def pretrain(
     loss.set_keys(labels=keys.LABELS)
     loss = ranks.wrap(loss)
     optimizer = make_optimizer(model, options.lr, options.weight_decay, kind=options.optimizer, rms=options.rms)
-    schedule = make_schedule(optimizer, options.steps, options.warmup)
+    schedule = make_schedule(optimizer, options.steps, options.warmup, options.schedule)
     run = Run(
         folder,
         {"policy": model, "best": best, "optimizer": optimizer, "schedule": schedule},

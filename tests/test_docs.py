@@ -390,7 +390,7 @@ def test_the_study_beside_the_results_has_the_options_that_its_command_gives(stu
         given = OmegaConf.to_container(options_told(experiment.scenes["source"], experiment.name), resolve=True)
         made = json.loads((study.folder / "experiments" / f"{experiment.name}.json").read_text())["config"]
         # None of these changes AdamW without start and noise.
-        for newer in ("start", "keep_gib", "rms", "recovery", "precision"):
+        for newer in ("start", "keep_gib", "rms", "recovery", "precision", "schedule"):
             given["pretraining"].pop(newer)
         assert given["pretraining"].pop("optimizer") == "adamw", "there was no other"
         for name in ("seeds", "model", "pretraining", "collection", "alignment", "evaluation", "decoding", "rankings"):

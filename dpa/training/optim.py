@@ -17,6 +17,7 @@ from dpa.training.muon import RMS, Muon
 
 T = TypeVar("T")
 OPTIMIZERS = ("adamw", "muon")
+SCHEDULES = ("linear", "cosine")
 MUON_SIDE = 32
 """Rows and columns that a matrix has at least to be made orthogonal; the thin ones of input features are AdamW's."""
 EMBEDDINGS = (nn.Embedding, nn.EmbeddingBag)
@@ -106,8 +107,8 @@ def make_schedule(
         >>> rates
         [0.5, 1.0, 1.0, 0.75, 0.5, 0.25]
     """
-    if shape not in ("linear", "cosine"):
-        raise ValueError(f"shape must be 'linear' or 'cosine', got {shape!r}.")
+    if shape not in SCHEDULES:
+        raise ValueError(f"shape must be one of {', '.join(SCHEDULES)}, got {shape!r}.")
     if not 0 <= warmup_steps < total_steps:
         raise ValueError(
             f"warmup_steps must lie in [0, total_steps), got {warmup_steps} of {total_steps}. Shorten the warm-up."

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from omegaconf import DictConfig, OmegaConf
 
 from dpa.policy.precision import PRECISIONS
-from dpa.training.optim import OPTIMIZERS
+from dpa.training.optim import OPTIMIZERS, SCHEDULES
 
 
 class Limit(NamedTuple):
@@ -66,6 +66,7 @@ LIMITS: dict[str, Limit] = {
     "grid": Limit(float, many=True),
     "start": Limit(str, empty=True),
     "optimizer": Limit(str, among=OPTIMIZERS),
+    "schedule": Limit(str, among=SCHEDULES),
     "precision": Limit(str, among=PRECISIONS),
     "has_lights": FLAG._replace(empty=True),
     "rankings_per_scene": Limit(float, empty=True),
