@@ -57,14 +57,15 @@ def make_card(run: Path, evaluations: dict[str, Path]) -> dict[str, Any]:
                 f"{file} has learnt from scenes of the source {source}, and the zoo takes policies of "
                 f"{', '.join(FREE_SOURCES)} alone: weights may not be given away where the licence of the scenes binds."
             )
-    options = read_json(run / "result.json")["options"]
+    told = read_json(run / "result.json")
     return {
         "sha256": zoo.checksum(file),
         "parameters": sum(value.numel() for value in build_policy(config).parameters()),
         "hours": round(seconds_trained(run) / SECONDS_OF_AN_HOUR, 2),
         "tune_nll": made["tune_nll"],
         "seed": made["seed"],
-        "options": options,
+        "num_scenes": told["num_scenes"],
+        "options": told["options"],
         "start": made["start"],
         "made_by": made["made_by"],
         "measures": {name: _measures(path, digest_of(weights)) for name, path in evaluations.items()},

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from matplotlib.image import imread
 
+from dpa import zoo
 from dpa.training.checkpoint import load_policy
 from dpa.training.loggers import read_curve
 from recipes.common.models import build_policy, write_policy
@@ -41,6 +42,16 @@ def test_every_training_has_a_row_and_a_curve_and_is_scored_once(
     assert len([path for path in before if path.stem in rows]) == 2
     assert run("references", *options("references", *asked)).out.count("long") == outcome.out.count("long")
     assert all(before[tmp_path / f"{name}.json"] == (tmp_path / f"{name}.json").stat().st_mtime_ns for name in rows)
+
+
+def test_a_policy_of_the_zoo_stands_in_the_table_by_its_card(run: Callable, options: Callable, tmp_path: Path) -> None:
+    name = "motionlm-nano-sumo"
+    outcome = run("references", *options("references", f"policies=[zoo:{name}]", "split=eval", f"output={tmp_path}"))
+    assert outcome.status == 0, outcome.err
+    (row,) = (line.split("│")[1:-1] for line in outcome.out.splitlines() if "│" in line)
+    told = zoo.card(name)
+    expected = (told["num_scenes"] / 1000, 6, 0.006, told["hours"], told["tune_nll"])
+    assert row[0].strip() == name and [float(cell) for cell in row[2:7]] == pytest.approx(expected, rel=1e-2)
 
 
 def test_a_policy_that_was_not_pre_trained_in_its_folder_is_refused_before_any_work(
