@@ -6,6 +6,7 @@ import gzip
 import importlib.util
 import multiprocessing
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -709,6 +710,16 @@ def test_front_bumper_and_compass_become_centre_and_heading(angle: float, headin
     assert np.allclose(tracks.centre[0], front - 2.0 * direction)
     assert np.allclose(np.cos(tracks.heading[0] - heading), 1.0)
     assert np.allclose(tracks.velocity[0], 10.0 * direction)
+
+
+def test_what_a_processor_computes_otherwise_in_the_last_bits_makes_no_other_scene() -> None:
+    rng = np.random.default_rng(0)
+    recording = record(rng.uniform(3.0, 500.0, (40, 1)) * [1.0, 0.5], 53.0, 1e4)
+    other = replace(recording, front=recording.front + rng.choice([-1e-13, 0.0, 1e-13], recording.front.shape))
+    here, there = make_tracks(recording), make_tracks(other)
+    assert not np.array_equal(recording.front, other.front)
+    assert np.array_equal(here.centre, there.centre)
+    assert np.array_equal(here.velocity, there.velocity)
 
 
 def test_a_teleport_or_a_hole_parts_a_track() -> None:

@@ -18,6 +18,8 @@ SMOOTHING_STEPS = 2.0
 """Standard deviation of the Gaussian that smooths a centre in time [steps of 0.1 s]."""
 KERNEL_REACH = 6
 """Half the length of that Gaussian's kernel [steps]; a shorter track is left out."""
+DECIMALS = 5
+"""Of a centre [m]: what processors compute differently in the last bits is the same scene on all of them."""
 AXLE_SHARE = {AgentKind.VEHICLE: 0.3, AgentKind.CYCLIST: 0.3, AgentKind.PEDESTRIAN: 1.0}
 """Distance from the centre to the pulled point, in lengths of the road user."""
 JUMP_SLACK = 0.5
@@ -63,7 +65,7 @@ def make_tracks(recording: Recording) -> Tracks:
     centre = np.full((len(runs), *raw.shape[1:]), np.nan)
     velocity = np.zeros_like(centre)
     for row, (i, start, end) in enumerate(runs):
-        centre[row, start:end] = smooth(raw[i, start:end])
+        centre[row, start:end] = smooth(raw[i, start:end]).round(DECIMALS)
         velocity[row, start:end] = np.gradient(centre[row, start:end], STEP_SECONDS, axis=0)
     valid = np.isfinite(centre[..., 0])
     share = np.array([AXLE_SHARE[AgentKind(kind)] for kind in recording.kind])
