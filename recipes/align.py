@@ -4,8 +4,9 @@
     torchrun --nproc-per-node 2 -m recipes.align method=dpa_omf policy=FILE preferences=DIR  # docs/scale.md
 
 Methods differ in one YAML each: dpa_omf, dpa_adef, sft_best_oa, sft_best_ade, adversarial_afd, and others under
-``config/method``. CAT-K (``method=cat_k``) learns from logs and takes no preferences. Run the same command again to go
-on after a kill.
+``config/method``. Some roll the policy out by themselves and take no preferences: CAT-K (``method=cat_k``), which
+learns from logs, and those that learn from rollouts of the policy as it is (``rloo``, ``grpo``, ``dpa_omf_on_policy``).
+Run the same command again to go on after a kill.
 """
 
 from __future__ import annotations
@@ -27,9 +28,10 @@ from envs.files import write_json
 from envs.progress import full_name, message
 from envs.store import SceneStore
 from recipes.alignment.closed_loop import ClosedLoopStep
-from recipes.alignment.data import ON_POLICY, check_data
+from recipes.alignment.data import ON_POLICY, ROLLED, check_data
 from recipes.alignment.inputs import Inputs
 from recipes.alignment.losses import check_fit, make_loss
+from recipes.alignment.on_policy import OnPolicyStep
 from recipes.alignment.snapshots import Snapshots
 from recipes.alignment.step import AlignmentStep
 from recipes.alignment.watch import Watch
@@ -135,13 +137,16 @@ def align(
 
 def make_step(
     method: DictConfig, inputs: Inputs, options: DictConfig, seed: int, device: str, ranks: Ranks
-) -> AlignmentStep | ClosedLoopStep:
+) -> AlignmentStep | ClosedLoopStep | OnPolicyStep:
     """What a step of the method does."""
     loss, model = make_loss(method.loss, inputs.model), inputs.model
-    if method.data.kind in ON_POLICY:
+    scenes = inputs.scenes.subset(inputs.learnt)
+    if method.data.kind in ROLLED:
+        loss = ranks.wrap(loss)
+        return OnPolicyStep(model, loss, scenes, inputs.context, method.data, options, seed, device, ranks)
+    if method.data.kind == "closed_loop":
         check_data(method.data, 0)
         loss.set_keys(labels=keys.LABELS, learnt=keys.LEARNT)
-        scenes = inputs.scenes.subset(inputs.learnt)
         follow = {"candidates": method.data.candidates, "recovery": method.data.recovery}
         return ClosedLoopStep(model, ranks.wrap(loss), scenes, inputs.context, follow, options, seed, device, ranks)
     candidates = inputs.candidates(method.data, seed)
@@ -157,8 +162,8 @@ def check_preferences(method: DictConfig, preferences: Path | None, expert: Path
     rolls = method.data.kind in ON_POLICY
     if rolls and (preferences is not None or expert is not None):
         raise ValueError(
-            f"{section}={method.name} learns from logs and reads no rollouts, got preferences={preferences} and "
-            f"expert={expert}; leave them out."
+            f"{section}={method.name} rolls the policy out by itself and reads no rollouts, got "
+            f"preferences={preferences} and expert={expert}; leave them out."
         )
     if not rolls and preferences is None:
         raise ValueError(

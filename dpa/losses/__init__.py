@@ -1,4 +1,4 @@
-"""Losses as TorchRL ``LossModule``s: next token (eq. 1) and preferences (eq. 4 and its relatives)."""
+"""Losses as TorchRL ``LossModule``s: next token (eq. 1), preferences (eq. 4 and its relatives) and policy gradients."""
 
 from dpa.losses.contrastive import ContrastivePreferenceLoss
 from dpa.losses.imitation import ImitationLoss
@@ -6,6 +6,7 @@ from dpa.losses.kahneman_tversky import KahnemanTverskyLoss
 from dpa.losses.network import token_network
 from dpa.losses.next_token import NextTokenLoss
 from dpa.losses.plackett_luce import PlackettLuceLoss
+from dpa.losses.policy_gradient import PolicyGradientLoss
 from dpa.losses.preference import Comparison, PreferenceLoss, Side
 from dpa.losses.saturation import SaturationWatch
 
@@ -16,6 +17,7 @@ __all__ = [
     "KahnemanTverskyLoss",
     "NextTokenLoss",
     "PlackettLuceLoss",
+    "PolicyGradientLoss",
     "PreferenceLoss",
     "SaturationWatch",
     "Side",

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 from omegaconf import DictConfig, OmegaConf
 
+from dpa.policy import Decoding
+from dpa.ranking import Distance
+from dpa.rewards import Baseline, Scale, check_rewards
 from envs import keys
+from recipes.common.cli import build
 from recipes.common.limits import is_number
+from recipes.common.rankings import build_distance
 
 SIDES = {
     "pairs": "pairs",
@@ -15,21 +22,32 @@ SIDES = {
     "adversarial": "pairs",
     "expert": "pairs",
     "closed_loop": "targets",
+    "own_pairs": "pairs",
+    "own_groups": "groups",
 }
 """Ways to learn from the rollouts of a scene (``config/method``), and what each gives: M pairs, M targets to imitate,
-two sets of any sizes, or one ranking, whose nearer half is the preferred side and the rest the unpreferred one."""
-ON_POLICY = ("closed_loop",)
+two sets of any sizes, one ranking, whose nearer half is the preferred side and the rest the unpreferred one, or all
+rollouts, each with its advantage."""
+ROLLED = ("own_pairs", "own_groups")
+"""Those of them that rank rollouts of the policy as it is, drawn anew in every step."""
+ON_POLICY = ("closed_loop", *ROLLED)
 """Those of them that roll the policy out themselves, in every step, and need no rollouts from before."""
-RANKED = ("pairs", "best", "sets", "ranking")
+RANKED = ("pairs", "best", "sets", "ranking", "own_pairs")
 """Those of them that read ranks."""
+PAIRED = ("pairs", "own_pairs")
+"""Those of them that pair rollouts by rank."""
+PAIRING = ("rank_by", "pairs", "num", "margin", "rankings_per_scene")
+ROLLING = ("num_rollouts", "decoding", "ranking")
 READ = {
-    "pairs": ("rank_by", "pairs", "num", "margin", "rankings_per_scene"),
+    "pairs": PAIRING,
     "best": ("rank_by", "num"),
     "sets": ("rank_by", "num", "num_unpreferred"),
     "ranking": ("rank_by", "num"),
     "adversarial": ("num",),
     "expert": ("num",),
     "closed_loop": ("candidates", "recovery"),
+    "own_pairs": (*ROLLING, *PAIRING),
+    "own_groups": (*ROLLING, "rewards", "baseline", "scale", "passes"),
 }
 """Options of each beside ``kind``."""
 PAIRS = ("nearest_farthest", "random", "all")
@@ -49,13 +67,17 @@ def num_candidates(data: DictConfig, held: int) -> tuple[int, int]:
         (8, 16)
     """
     data = check_data(data, held)
-    if data.kind in ON_POLICY:
+    if data.kind == "closed_loop":
         return 1, 0
+    if data.kind in ROLLED:
+        held = data.num_rollouts
+    if data.kind == "own_groups":
+        return held, 0
     if data.kind == "ranking":
         whole = data.num or held
         return (whole + 1) // 2, whole // 2
-    num = held * (held - 1) // 2 if data.kind == "pairs" and data.pairs == "all" else data.num
-    if data.kind == "pairs" and data.rankings_per_scene is not None:
+    num = held * (held - 1) // 2 if data.kind in PAIRED and data.pairs == "all" else data.num
+    if data.kind in PAIRED and data.rankings_per_scene is not None:
         num = min(num, max(1, int(data.rankings_per_scene)))  # of half a pair in the mean, a scene has one or none
     return num, {"best": 0, "sets": data.get("num_unpreferred")}.get(data.kind, num)
 
@@ -65,7 +87,7 @@ def check_data(data: DictConfig, held: int) -> DictConfig:
 
     Args:
         data: of a method, see :func:`~recipes.alignment.candidates.make_candidates`.
-        held: K, rollouts of a scene.
+        held: K, rollouts of a scene; of what a method rolls out itself, its options say so.
 
     Returns:
         The options, shares of the rollouts as whole numbers.
@@ -73,9 +95,35 @@ def check_data(data: DictConfig, held: int) -> DictConfig:
     Raises:
         ValueError: an unknown kind, option, ranking or way to pair, or more rollouts than there are.
     """
+    if data.get("kind") in ROLLED:
+        check_rolling(data)
+        held = data.num_rollouts
     counted = _counted(data, held)
     _check(counted, held, data)
     return counted
+
+
+def check_rolling(data: DictConfig) -> tuple[Decoding, Distance]:
+    """How a method draws rollouts of its own, and what ranks them.
+
+    Args:
+        data: of a kind in :data:`ROLLED`.
+
+    Raises:
+        ValueError: naming the option that cannot be.
+    """
+    _check_read(data)
+    if missing := [name for name in READ[data.kind] if name not in data]:
+        raise ValueError(
+            f"method.data.kind={data.kind} needs method.data.{missing[0]}; begin with method=rloo or "
+            "method=dpa_omf_on_policy, which have all of it."
+        )
+    if type(data.num_rollouts) is not int or data.num_rollouts < 2:
+        raise ValueError(
+            f"method.data.num_rollouts must be 2 or more, got {data.num_rollouts!r}: a rollout is ranked among others."
+        )
+    decoding = build(Decoding, data.decoding, "method.data.decoding")
+    return decoding, build_distance(data.ranking, "method.data.ranking")
 
 
 def _counted(data: DictConfig, held: int) -> DictConfig:
@@ -96,31 +144,28 @@ def _asked(given: DictConfig, data: DictConfig, name: str) -> str:
 def _check(data: DictConfig, held: int, given: DictConfig) -> None:
     if data.kind not in SIDES:
         raise ValueError(f"method.data.kind must be one of {', '.join(SIDES)}, got {data.kind!r}.")
-    if unread := sorted(set(map(str, data)) - {"kind", *READ[data.kind]}):
-        raise ValueError(
-            f"method.data.{unread[0]} says nothing to method.data.kind={data.kind}, which takes "
-            f"{', '.join(READ[data.kind])}; leave it out (~method.data.{unread[0]})."
-        )
-    if data.kind in ON_POLICY:
+    _check_read(data)
+    if data.kind == "own_groups":
+        return _check_groups(data)
+    if data.kind == "closed_loop":
         if type(data.get("candidates")) is not int or data.candidates < 1:
             raise ValueError(f"method.data.candidates must be 1 or more, got {data.get('candidates')!r}.")
         if not is_number(data.get("recovery")) or not 0 < data.recovery <= 1:
             raise ValueError(f"method.data.recovery must lie in (0, 1], got {data.get('recovery')!r}.")
-        return
+        return None
     if data.kind in RANKED and data.rank_by not in (keys.DISTANCE, keys.ADE):
         raise ValueError(f"method.data.rank_by must be distance or ade, got {data.rank_by!r}.")
-    if data.kind == "pairs" and data.pairs not in PAIRS:
+    if data.kind in PAIRED and data.pairs not in PAIRS:
         raise ValueError(f"method.data.pairs must be one of {', '.join(PAIRS)}, got {data.pairs!r}.")
-    if data.kind == "pairs" and data.pairs == "all":
+    if data.kind in PAIRED and data.pairs == "all":
         if data.num is not None:
             raise ValueError(
                 f"method.data.pairs=all takes every pair, and {_asked(given, data, 'num')} asks for some; say "
                 "method.data.num=null, and rankings_per_scene to keep fewer."
             )
-        _check_pairs(data, held * (held - 1) // 2)
-        return
+        return _check_pairs(data, held * (held - 1) // 2)
     if data.kind == "ranking" and data.num is None:
-        return
+        return None
     for name in ("num", "num_unpreferred") if data.kind == "sets" else ("num",):
         if type(data.get(name)) is not int:
             raise ValueError(
@@ -129,8 +174,26 @@ def _check(data: DictConfig, held: int, given: DictConfig) -> None:
         if data[name] < 1:
             raise ValueError(f"method.data.{name} must be 1 or more, got {data[name]}.")
     _check_enough(data, held, given)
-    if data.kind == "pairs":
-        _check_pairs(data, data.num)
+    return _check_pairs(data, data.num) if data.kind in PAIRED else None
+
+
+def _check_read(data: DictConfig) -> None:
+    read = READ[data.kind]
+    if unread := sorted(set(map(str, data)) - {"kind", *read}):
+        raise ValueError(
+            f"method.data.{unread[0]} says nothing to method.data.kind={data.kind}, which takes {', '.join(read)}; "
+            f"leave it out (~method.data.{unread[0]})."
+        )
+
+
+def _check_groups(data: DictConfig) -> None:
+    for name, known in (("baseline", get_args(Baseline)), ("scale", get_args(Scale))):
+        if data[name] not in known:
+            raise ValueError(f"method.data.{name} must be {' or '.join(known)}, got {data[name]!r}.")
+    for name, weight in data.rewards.items():
+        if not is_number(weight):
+            raise ValueError(f"method.data.rewards.{name} must be a number, got {weight!r}.")
+    check_rewards(data.rewards)
 
 
 def _check_pairs(data: DictConfig, pairs: int) -> None:
@@ -149,7 +212,7 @@ def _check_pairs(data: DictConfig, pairs: int) -> None:
 
 def _check_enough(data: DictConfig, held: int, given: DictConfig) -> None:
     asked, needed = _asked(given, data, "num"), data.num
-    if data.kind == "pairs":
+    if data.kind in PAIRED:
         needed *= 2
     elif data.kind == "sets":
         asked = f"{asked} and {_asked(given, data, 'num_unpreferred')}"

@@ -21,7 +21,10 @@ from recipes.common.models import open_policy, weights_digest
 from recipes.common.rankings import open_preferences
 from recipes.common.scenes import fingerprint
 
-OBSERVING = ("checkpoint_interval", "max_rows", "snapshots", "watch_interval", "watch_scenes", "watch_pairs")
+OBSERVING = (
+    *("checkpoint_interval", "max_rows", "snapshots", "watch_interval", "watch_scenes", "watch_pairs"),
+    *("memory", "workers"),
+)
 """Options of the section ``alignment`` that change nothing about the policy."""
 
 

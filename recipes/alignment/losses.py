@@ -10,11 +10,12 @@ from dpa.losses import (
     ImitationLoss,
     KahnemanTverskyLoss,
     PlackettLuceLoss,
+    PolicyGradientLoss,
     token_network,
 )
 from dpa.policy import MotionLM
 from envs import keys
-from recipes.alignment.data import SIDES, num_candidates
+from recipes.alignment.data import PAIRED, SIDES, num_candidates
 from recipes.alignment.draws import num_drawn
 from recipes.common.cli import build
 
@@ -23,9 +24,16 @@ LOSSES: dict[str, type[LossModule]] = {
     "kahneman_tversky": KahnemanTverskyLoss,
     "plackett_luce": PlackettLuceLoss,
     "next_token": ImitationLoss,
+    "policy_gradient": PolicyGradientLoss,
 }
 """Losses that a method's YAML can name."""
-FITS = {"pairs": ("pairs",), "sets": ("pairs", "sets"), "ranking": ("ranking",), "targets": ("targets",)}
+FITS = {
+    "pairs": ("pairs",),
+    "sets": ("pairs", "sets"),
+    "ranking": ("ranking",),
+    "targets": ("targets",),
+    "groups": ("groups",),
+}
 """What a loss can read, by its ``sides``: pairs may be read as two sets."""
 
 
@@ -49,7 +57,7 @@ def check_fit(method: DictConfig, alignment: DictConfig, held: int) -> None:
         ValueError: for instance a ranking loss for pairs, or for rankings of two.
     """
     data = method.data
-    if method.loss.get("credit") == "agent" and not (data.kind == "pairs" and data.rank_by == keys.DISTANCE):
+    if method.loss.get("credit") == "agent" and not (data.kind in PAIRED and data.rank_by == keys.DISTANCE):
         raise ValueError(
             "method.loss.credit=agent needs pairs that agents are ranked in one by one: method.data.kind=pairs and "
             f"rank_by={keys.DISTANCE}, got {data.kind} and {data.get('rank_by')}."
@@ -63,6 +71,11 @@ def check_fit(method: DictConfig, alignment: DictConfig, held: int) -> None:
                 f"{alignment.pairs_per_scene} leave {ranked}; say method.data.num=null and "
                 "alignment.pairs_per_scene=4, or method=dpo."
             )
+    if data.get("passes", 1) > 1 and method.loss.get("clip") is None:
+        raise ValueError(
+            f"method.data.passes={data.passes} takes several steps with the same rollouts, which without a clip lead "
+            "away from the policy that drew them; say method.loss.clip=0.2, or method.data.passes=1."
+        )
     wanted = getattr(LOSSES.get(method.loss.kind), "sides", None)
     given = SIDES.get(method.data.kind)
     if wanted is None or given is None or given in FITS[wanted]:

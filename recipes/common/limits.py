@@ -43,6 +43,7 @@ COUNTS = (
     *("steps", "batch_size", "batch_scenes", "scenes_per_step", "pairs_per_scene", "max_rows", "stride", "width"),
     *("checkpoint_interval", "tune_interval", "watch_interval", "look_interval", "watch_scenes", "watch_pairs"),
     *("decision_steps", "horizon", "max_controlled", "max_pieces", "patience", "pretraining.max_agents", "window"),
+    *("passes",),
 )
 BINS = ("bins.vehicle", "bins.pedestrian", "bins.cyclist")
 LIMITS: dict[str, Limit] = {
@@ -57,6 +58,8 @@ LIMITS: dict[str, Limit] = {
     "pretraining.recovery": SHARE._replace(above=True),
     **dict.fromkeys(("weight_decay", "rotation", "keep_gib"), Limit(float, least=0)),
     **dict.fromkeys(("loss.alpha", "loss.cloning", "loss.conservative", "margin"), Limit(float)),
+    **dict.fromkeys(("loss.kl", "loss.entropy"), Limit(float, least=0)),
+    "loss.clip": POSITIVE._replace(empty=True),
     **dict.fromkeys(("held_out", "solver.window"), Limit(float)),
     **dict.fromkeys(("compile", "arrivals", "tokenized", "loss.reference"), FLAG),
     **dict.fromkeys(("output", "policy", "preferences"), Limit(str)),
@@ -70,7 +73,7 @@ LIMITS: dict[str, Limit] = {
     "precision": Limit(str, among=PRECISIONS),
     "has_lights": FLAG._replace(empty=True),
     "rankings_per_scene": Limit(float, empty=True),
-    "collection.workers": Limit(dict),
+    **dict.fromkeys(("collection.workers", "alignment.workers"), Limit(dict)),
     "seeds": Limit(int, many=True),
     "snapshots": COUNT._replace(many=True),
 }

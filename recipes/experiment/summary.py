@@ -12,7 +12,7 @@ from dpa.policy import Decoding
 from dpa.report.experiment import read_json
 from dpa.report.statistics import compare_methods
 from dpa.report.table import REFERENCE
-from recipes.alignment.data import num_candidates
+from recipes.alignment.data import ROLLED, num_candidates
 from recipes.alignment.draws import num_drawn
 from recipes.alignment.likelihoods import PROBED
 from recipes.common.cli import plain
@@ -206,6 +206,8 @@ def _read_in_step(cfg: DictConfig, method: str) -> int:
     """Rollouts that a step of a method reads."""
     options, data = setup_of(cfg, method).merged(cfg.alignment), cfg.methods[method].data
     held = num_candidates(data, cfg.collection.num_rollouts)
+    if data.kind in ROLLED:  # a step reads all that it has rolled out, or all of its pairs
+        return options.scenes_per_step * sum(held)
     return options.scenes_per_step * sum(num_drawn(*held, options.pairs_per_scene))
 
 

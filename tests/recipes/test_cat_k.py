@@ -66,7 +66,7 @@ def test_more_rows_in_a_pass_change_rounding_alone(
 @pytest.mark.parametrize(
     ("more", "told"),
     [
-        (["preferences=runs/x"], "cat_k learns from logs and reads no rollouts, got preferences=runs/x"),
+        (["preferences=runs/x"], "cat_k rolls the policy out by itself and reads no rollouts, got preferences=runs/x"),
         (["method=dpa_omf"], "preferences is not given"),
         (["method.data.candidates=0"], "method.data.candidates"),
         (["method.data.candidates=170"], "candidates must be 1 to 169"),

@@ -323,7 +323,8 @@ def test_a_value_that_an_option_cannot_have_is_told_before_any_work(
 def test_every_limit_is_that_of_an_option_and_holds_for_its_defaults() -> None:
     seen, folder = set(), Path(CONFIG["config_path"])
     experiments = [("compare", [f"experiment={path.stem}"]) for path in (folder / "experiment").glob("*.yaml")]
-    for name, chosen in [*((path.stem, []) for path in folder.glob("*.yaml")), *experiments]:
+    methods = [("align", [f"method={path.stem}"]) for path in (folder / "method").glob("*.yaml")]
+    for name, chosen in [*((path.stem, []) for path in folder.glob("*.yaml")), *experiments, *methods]:
         if chosen == ["experiment=base"]:
             continue
         with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):

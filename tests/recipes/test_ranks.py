@@ -166,6 +166,20 @@ def test_two_ranks_train_like_one_process_for_fifty_steps(
     assert_same(tmp_path / name, runs / name, CURVES[name])
 
 
+@pytest.mark.slow
+def test_two_ranks_roll_out_and_learn_like_one_process(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path
+) -> None:
+    arguments = options(
+        "align", "method=rloo", "method.data.num_rollouts=4", "alignment.scenes_per_step=4", "alignment.lr=1e-4",
+        f"policy={runs / 'pretrain/policy.pt'}",
+    )  # fmt: skip
+    status, output = run_ranks(2, "align", *arguments, f"output={tmp_path / 'two'}")
+    assert status == 0, output
+    assert run("align", *arguments, f"output={tmp_path / 'one'}").status == 0
+    assert_same(tmp_path / "two", tmp_path / "one", ("train/rollout_distance", "train/loss_policy", "train/kl"))
+
+
 # --- a kill ---------------------------------------------------------------------------------------------------------
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["pretrain", "dpa_omf"])

@@ -316,7 +316,10 @@ def test_a_margin_leaves_the_clear_pairs(runs: Path, options: Callable) -> None:
         ({"num": 1.5}, "method.data.num must be a whole number, or a share between 0 and 1, got 1.5"),
         ({"kind": "ranking", "num": 1}, "a ranking needs two rollouts, got method.data.num=1"),
         ({"kind": "expert"}, "needs rollouts of an expert, and there are none"),
-        ({"kind": "worst"}, "must be one of pairs, best, sets, ranking, adversarial, expert, closed_loop, got 'worst'"),
+        (
+            {"kind": "worst"},
+            "expert, closed_loop, own_pairs, own_groups, got 'worst'",
+        ),
     ],
 )
 def test_options_that_give_no_pairs_are_told(

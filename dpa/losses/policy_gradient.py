@@ -1,0 +1,157 @@
+"""Policy gradients on groups of rollouts: REINFORCE with a baseline of the group, and its clipped form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictParams, dispatch
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from dpa.losses.network import (
+    CONTEXT,
+    hold_network,
+    logits_under,
+    masked_mean,
+    reference_logits,
+    token_divergence,
+    token_entropy,
+    token_log_prob,
+)
+from dpa.losses.preference import check_not_negative, check_positive
+from envs import keys
+
+
+class PolicyGradientLoss(LossModule):
+    """What raises the likelihood of tokens with an advantage above 0 and lowers that of the others.
+
+    Without ``clip`` it is REINFORCE, ``-advantage * log pi``; with it PPO's surrogate (Schulman et al., 2017, eq. 7),
+    ``-min(r * advantage, clip(r, 1 - clip, 1 + clip) * advantage)`` of the ratio r of likelihoods now and when the
+    rollout was drawn, for several passes over the same rollouts. Both are means over the valid tokens, and have the
+    same gradient in the first pass.
+
+    TorchRL's ``GRPOLoss`` is for language models and ``ClipPPOLoss`` wants a critic and the distribution of an actor,
+    decision by decision; rollouts of a scene are scored here in one teacher-forced pass, as preferences are. The keys
+    are theirs: ``advantage``, and beside it the log-probabilities of the policy that drew.
+
+    A frozen copy of the network as it is when the loss is made is the reference of ``kl``.
+
+    Args:
+        actor_network: from :func:`~dpa.losses.token_network`.
+
+    Keyword Args:
+        clip: half the width of the range of ratios; None for REINFORCE.
+        kl: weight of the KL divergence of the policy from the reference, per token, over the whole vocabulary.
+        entropy: weight of the policy's entropy, which it then keeps up.
+
+    Raises:
+        ValueError: an option outside its range.
+
+    Returns ``loss_policy``, ``loss_kl``, ``loss_entropy`` and, detached: ``kl`` and ``entropy`` per token [nats],
+    ``nll`` of the rollouts' tokens [nats], ``clipped`` (share of tokens whose ratio the clip holds back) and ``ratio``
+    (mean over tokens; both of a clipped loss alone).
+
+    Examples:
+        >>> from dpa.losses import token_network
+        >>> from dpa.policy import MotionLM, collate_contexts, make_context
+        >>> from dpa.tokens import VerletTokenizer
+        >>> from envs.sources.synthetic import straight_road
+        >>> loss = PolicyGradientLoss(token_network(MotionLM("nano", VerletTokenizer())), kl=0.1)
+        >>> batch = TensorDict(
+        ...     {
+        ...         "context": collate_contexts([make_context(straight_road(2))]),
+        ...         "tokens": torch.randint(169, (1, 4, 2, 16)),
+        ...         "token_valid": torch.ones(1, 1, 2, 16, dtype=torch.bool),
+        ...         "advantage": torch.tensor([1.0, -1.0, 0.5, -0.5])[None, :, None, None],
+        ...     },
+        ...     batch_size=[1],
+        ... )
+        >>> loss(batch)["loss_kl"].item()  # before the first step
+        0.0
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys of the input.
+
+        Attributes:
+            context: :class:`~dpa.policy.SceneContext` of batch size ``[S]``.
+            tokens: ``[S, K, A, T]`` int64.
+            token_valid: ``[S, 1, A, T]`` bool.
+            advantage: broadcastable to ``[S, K, A, T]``.
+            old_log_prob: ``[S, K, A, T]``, read by a clipped loss alone.
+        """
+
+        context: NestedKey = CONTEXT
+        tokens: NestedKey = keys.TOKENS
+        token_valid: NestedKey = keys.TOKEN_VALID
+        advantage: NestedKey = keys.ADVANTAGE
+        old_log_prob: NestedKey = keys.OLD_LOG_PROB
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+    actor_network: TensorDictModule
+    actor_network_params: TensorDictParams
+    target_actor_network_params: TensorDictParams
+    sides = "groups"
+    """It reads all rollouts of a scene; see :attr:`~dpa.losses.PreferenceLoss.sides`."""
+
+    def __init__(
+        self, actor_network: TensorDictModule, *, clip: float | None = None, kl: float = 0.0, entropy: float = 0.0
+    ) -> None:
+        super().__init__()
+        if clip is not None:
+            check_positive("clip", clip)
+        check_not_negative("kl", kl)
+        check_not_negative("entropy", entropy)
+        hold_network(self, actor_network, keep_reference=True)
+        self.clip, self.kl, self.entropy = clip, kl, entropy
+        clipped = [] if clip is None else ["clipped", "ratio"]
+        self.out_keys = ["loss_policy", "loss_kl", "loss_entropy", "kl", "entropy", "nll", *clipped]
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Where the input lies, in the order in which plain tensors are taken."""
+        accepted = self.tensor_keys
+        read = [accepted.context, accepted.tokens, accepted.token_valid, accepted.advantage]
+        return read if self.clip is None else [*read, accepted.old_log_prob]
+
+    def _forward_value_estimator_keys(self, **_: object) -> None:
+        """There is no value estimator."""
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The loss and its diagnostics, each a scalar, of a batch of groups."""
+        accepted = self.tensor_keys
+        tokens, valid = tensordict[accepted.tokens], tensordict[accepted.token_valid]
+        batch = TensorDict(
+            {CONTEXT: tensordict[accepted.context], keys.TOKENS: tokens, keys.TOKEN_VALID: valid},
+            batch_size=tokens.shape[:1],
+        )
+        logits = logits_under(self.actor_network_params, self.actor_network, batch)
+        log_prob = token_log_prob(logits, tokens)
+        gain, diagnostics = self._gain(log_prob, tensordict)
+        drift = masked_mean(token_divergence(logits, reference_logits(self, batch)), valid)
+        entropy = masked_mean(token_entropy(logits), valid)
+        diagnostics |= {"kl": drift, "entropy": entropy, "nll": masked_mean(-log_prob, valid)}
+        out = {
+            "loss_policy": -masked_mean(gain, valid),
+            "loss_kl": self.kl * drift,
+            "loss_entropy": -self.entropy * entropy,
+            **{name: value.detach() for name, value in diagnostics.items()},
+        }
+        return TensorDict(out, batch_size=[])
+
+    def _gain(self, log_prob: Tensor, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """``[S, K, A, T]`` that is to become large, and what is told of the ratios."""
+        accepted = self.tensor_keys
+        advantage = tensordict[accepted.advantage]
+        if self.clip is None:
+            return advantage * log_prob, {}
+        ratio = (log_prob - tensordict[accepted.old_log_prob]).exp()
+        free, held = advantage * ratio, advantage * ratio.clamp(1 - self.clip, 1 + self.clip)
+        valid = tensordict[accepted.token_valid]
+        told = {"clipped": masked_mean((held < free).to(ratio.dtype), valid), "ratio": masked_mean(ratio, valid)}
+        return torch.minimum(free, held), told

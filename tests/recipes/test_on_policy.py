@@ -1,0 +1,132 @@
+"""Methods that learn from rollouts of the policy as it is: RLOO, GRPO and pairs of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from dpa.training.checkpoint import load_policy
+from dpa.training.loggers import read_curve
+from recipes.alignment.on_policy import tasks_of
+
+METHODS = ("rloo", "grpo", "dpa_omf_on_policy")
+FEW = ("method.data.num_rollouts=4",)
+
+
+@pytest.fixture(scope="module")
+def origin(tmp_path_factory: pytest.TempPathFactory, run: Callable, options: Callable) -> Path:
+    """A trained policy."""
+    folder = tmp_path_factory.mktemp("origin")
+    assert run("pretrain", *options("pretrain", f"output={folder}", "pretraining.lr=1e-2")).status == 0
+    return folder / "policy.pt"
+
+
+def aligning(options: Callable, policy: Path, method: str, output: Path, *more: str) -> list[str]:
+    return options("align", f"method={method}", f"policy={policy}", f"output={output}", *FEW, *more)
+
+
+def assert_same(mine: Path, other: Path, atol: float = 0.0) -> None:
+    ours, theirs = (load_policy(folder / "policy.pt")[0] for folder in (mine, other))
+    assert all(torch.allclose(ours[name], value, rtol=0, atol=atol) for name, value in theirs.items())
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_it_needs_no_preferences_and_tells_what_it_rolls_out(
+    run: Callable, options: Callable, origin: Path, tmp_path: Path, method: str
+) -> None:
+    outcome = run("align", *aligning(options, origin, method, tmp_path))
+    assert outcome.status == 0, outcome.err
+    for curve in ("rollout_distance", "rollout_ade", "seconds_rollout", "seconds_learning", "kl", "entropy"):
+        values = [value for _, value in read_curve(tmp_path, f"train/{curve}")]
+        assert len(values) == 4 and min(values) >= 0, curve
+    assert read_curve(tmp_path, "train/kl")[0][1] == pytest.approx(0.0, abs=1e-6) or method == "grpo"
+    before, after = load_policy(origin)[0], load_policy(tmp_path / "policy.pt")
+    assert after[2]["method"] == method
+    assert any(not torch.equal(after[0][name], value) for name, value in before.items())
+
+
+def test_a_policy_gradient_comes_nearer_to_the_log(
+    run: Callable, options: Callable, origin: Path, tmp_path: Path
+) -> None:
+    long = ("alignment.steps=40", "alignment.lr=3e-3", "alignment.scenes_per_step=8", "method.data.num_rollouts=8")
+    outcome = run("align", *aligning(options, origin, "rloo", tmp_path, *long))
+    assert outcome.status == 0, outcome.err
+    distances = [value for _, value in read_curve(tmp_path, "train/rollout_distance")]
+    assert sum(distances[-5:]) < 0.9 * sum(distances[:5])
+
+
+def test_rows_of_a_pass_change_rounding_alone(run: Callable, options: Callable, origin: Path, tmp_path: Path) -> None:
+    for name, rows in (("one", 1), ("all", 999)):
+        outcome = run("align", *aligning(options, origin, "rloo", tmp_path / name, f"alignment.max_rows={rows}"))
+        assert outcome.status == 0, outcome.err
+    assert_same(tmp_path / "one", tmp_path / "all", atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
+def test_a_run_that_is_cut_goes_on_to_the_same_weights(
+    run: Callable, options: Callable, kill_when: Callable, origin: Path, tmp_path: Path, method: str
+) -> None:
+    many = ("alignment.steps=30",)
+    assert run("align", *aligning(options, origin, method, tmp_path / "whole", *many)).status == 0
+    killed = aligning(options, origin, method, tmp_path / "killed", *many)
+    kill_when((tmp_path / "killed/checkpoints/step_0000000004.pt").exists, "align", *killed)
+    assert not (tmp_path / "killed/policy.pt").exists()
+    assert run("align", *killed).status == 0
+    assert_same(tmp_path / "killed", tmp_path / "whole")
+
+
+@pytest.mark.slow
+def test_processes_that_roll_out_change_rounding_alone(
+    run: Callable, options: Callable, origin: Path, tmp_path: Path
+) -> None:
+    crew = ("alignment.workers.backend=process", "alignment.workers.count=2")
+    for name, more in (("alone", ()), ("processes", crew)):
+        outcome = run("align", *aligning(options, origin, "rloo", tmp_path / name, *more))
+        assert outcome.status == 0, outcome.err
+    assert_same(tmp_path / "alone", tmp_path / "processes", atol=1e-5)
+
+
+def test_no_two_steps_roll_out_by_the_same_draws_and_all_workers_have_a_part() -> None:
+    sizes = {0: 3, 1: 4, 2: 5}
+    tasks = {step: tasks_of(step, sizes, num_rollouts=4, most=1000, workers=2) for step in (0, 1)}
+    drawn = {step: {(task.scenes, k) for task in each for piece in task.pieces for k in piece}
+             for step, each in tasks.items()}  # fmt: skip
+    assert not drawn[0] & drawn[1]
+    assert all(len(each) >= 2 for each in tasks.values())
+    assert {k for _, k in drawn[1]} == {4, 5, 6, 7}
+
+
+@pytest.mark.parametrize(
+    ("method", "more", "told"),
+    [
+        ("rloo", ["preferences=runs/x"], "rloo rolls the policy out by itself and reads no rollouts"),
+        ("rloo", ["method.data.num_rollouts=1"], "method.data.num_rollouts must be 2 or more, got 1"),
+        ("rloo", ["method.data.passes=2"], "say method.loss.clip=0.2, or method.data.passes=1"),
+        ("rloo", ["method.data.rewards.agent_distance=0"], "weigh 0"),
+        ("rloo", ["+method.data.rewards.speed=1"], "there is no reward 'speed'"),
+        ("rloo", ["method.data.rewards.ade=much"], "method.data.rewards.ade must be a number, got 'much'"),
+        ("rloo", ["method.data.baseline=none"], "method.data.baseline must be leave_one_out or mean, got 'none'"),
+        ("rloo", ["method.data.decoding.top_p=0"], "top_p"),
+        ("rloo", ["method.data.ranking.features=all"], "unknown feature set 'all'"),
+        ("rloo", ["method.loss.kl=-1"], "method.loss.kl must be 0 or more, got -1"),
+        ("rloo", ["~method.data.passes"], "method.data.kind=own_groups needs method.data.passes"),
+        ("rloo", ["alignment.workers.count=2"], "2 workers need backend=process"),
+        ("grpo", ["method.loss.clip=0"], "method.loss.clip must be above 0, got 0"),
+        ("dpa_omf_on_policy", ["method.data.num=3"], "method.data.num=3 needs 6 rollouts of a scene and there are 4"),
+        ("dpa_omf_on_policy", ["method.loss.kind=policy_gradient"], "policy_gradient learns from groups"),
+    ],
+)
+def test_options_that_do_not_fit_end_in_one_error(
+    run: Callable, options: Callable, origin: Path, tmp_path: Path, method: str, more: list[str], told: str
+) -> None:
+    outcome = run("align", *aligning(options, origin, method, tmp_path / "run"), *more)
+    assert outcome.status == 2 and told in outcome.err and outcome.err.count("error:") == 1, outcome.err
+    assert not (tmp_path / "run/checkpoints").exists()
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])
