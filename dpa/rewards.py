@@ -63,17 +63,18 @@ def reward_of(ranked: TensorDictBase, weights: Mapping[str, float]) -> Tensor:
     return sum(weight * REWARDS[name](ranked) for name, weight in weights.items() if weight)
 
 
-def advantages(reward: Tensor, *, baseline: Baseline = "leave_one_out", scale: Scale = "group") -> Tensor:
+def advantages(reward: Tensor, *, baseline: Baseline = "leave_one_out", scale: Scale = "none") -> Tensor:
     """How much better each rollout was than the others of its group.
 
     Args:
         reward: ``[S, K, ...]``, K of 2 or more.
 
     Keyword Args:
-        baseline: the mean of the other K - 1 rollouts (RLOO; Ahmadian et al., 2024), which the rollout has no part in
-            and which so leaves the gradient unbiased, or that of all K (GRPO; Shao et al., 2024).
-        scale: divide by the standard deviation of the group, each agent's own where agents have rewards of their own.
-            Where it is below :data:`SMALLEST_SPREAD` there is nothing to prefer, and the advantage is 0.
+        baseline: the mean of the other K - 1 rollouts (RLOO; Ahmadian et al., 2024), in which the rollout has no part,
+            or that of all K (GRPO; Shao et al., 2024), whose advantages are (K - 1) / K of the former.
+        scale: none (RLOO, whose gradient is unbiased), or divide by the standard deviation of the group (GRPO), each
+            agent's own where agents have rewards of their own, so that all groups and agents weigh alike. Where it is
+            below :data:`SMALLEST_SPREAD` there is nothing to prefer, and the advantage is 0.
 
     Returns:
         Like ``reward``.
@@ -83,11 +84,11 @@ def advantages(reward: Tensor, *, baseline: Baseline = "leave_one_out", scale: S
 
     Examples:
         >>> import torch
-        >>> advantages(torch.tensor([[1.0, 2.0, 6.0]]), scale="none")
+        >>> advantages(torch.tensor([[1.0, 2.0, 6.0]]))
         tensor([[-3.0000, -1.5000,  4.5000]])
-        >>> advantages(torch.tensor([[1.0, 2.0, 6.0]]), baseline="mean", scale="none")
+        >>> advantages(torch.tensor([[1.0, 2.0, 6.0]]), baseline="mean")
         tensor([[-2., -1.,  3.]])
-        >>> advantages(torch.tensor([[-1.0, 1.0], [5.0, 5.0]]), baseline="mean")
+        >>> advantages(torch.tensor([[-1.0, 1.0], [5.0, 5.0]]), baseline="mean", scale="group")
         tensor([[-0.7071,  0.7071],
                 [ 0.0000,  0.0000]])
     """

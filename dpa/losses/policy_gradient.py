@@ -30,11 +30,12 @@ class PolicyGradientLoss(LossModule):
     Without ``clip`` it is REINFORCE, ``-advantage * log pi``; with it PPO's surrogate (Schulman et al., 2017, eq. 7),
     ``-min(r * advantage, clip(r, 1 - clip, 1 + clip) * advantage)`` of the ratio r of likelihoods now and when the
     rollout was drawn, for several passes over the same rollouts. Both are means over the valid tokens, and have the
-    same gradient in the first pass.
+    same gradient in the first pass. The rollouts must be drawn from the policy itself: of a nucleus or another
+    temperature this is not the gradient.
 
     TorchRL's ``GRPOLoss`` is for language models and ``ClipPPOLoss`` wants a critic and the distribution of an actor,
-    decision by decision; rollouts of a scene are scored here in one teacher-forced pass, as preferences are. The keys
-    are theirs: ``advantage``, and beside it the log-probabilities of the policy that drew.
+    decision by decision; rollouts of a scene are scored here in one teacher-forced pass, as preferences are. Names of
+    keys and outputs are theirs where they mean the same.
 
     A frozen copy of the network as it is when the loss is made is the reference of ``kl``.
 
@@ -49,9 +50,9 @@ class PolicyGradientLoss(LossModule):
     Raises:
         ValueError: an option outside its range.
 
-    Returns ``loss_policy``, ``loss_kl``, ``loss_entropy`` and, detached: ``kl`` and ``entropy`` per token [nats],
-    ``nll`` of the rollouts' tokens [nats], ``clipped`` (share of tokens whose ratio the clip holds back) and ``ratio``
-    (mean over tokens; both of a clipped loss alone).
+    Returns ``loss_objective``, ``loss_kl_to_ref``, ``loss_entropy`` and, detached: ``kl`` and ``entropy`` per token
+    [nats], ``nll`` of the rollouts' tokens [nats] and, of a clipped loss, ``clip_fraction``: the share of tokens whose
+    ratio the clip holds back.
 
     Examples:
         >>> from dpa.losses import token_network
@@ -68,7 +69,7 @@ class PolicyGradientLoss(LossModule):
         ...     },
         ...     batch_size=[1],
         ... )
-        >>> loss(batch)["loss_kl"].item()  # before the first step
+        >>> loss(batch)["loss_kl_to_ref"].item()  # before the first step
         0.0
     """
 
@@ -81,14 +82,14 @@ class PolicyGradientLoss(LossModule):
             tokens: ``[S, K, A, T]`` int64.
             token_valid: ``[S, 1, A, T]`` bool.
             advantage: broadcastable to ``[S, K, A, T]``.
-            old_log_prob: ``[S, K, A, T]``, read by a clipped loss alone.
+            sample_log_prob: ``[S, K, A, T]`` when the tokens were drawn, read by a clipped loss alone.
         """
 
         context: NestedKey = CONTEXT
         tokens: NestedKey = keys.TOKENS
         token_valid: NestedKey = keys.TOKEN_VALID
         advantage: NestedKey = keys.ADVANTAGE
-        old_log_prob: NestedKey = keys.OLD_LOG_PROB
+        sample_log_prob: NestedKey = keys.SAMPLE_LOG_PROB
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
@@ -108,15 +109,15 @@ class PolicyGradientLoss(LossModule):
         check_not_negative("entropy", entropy)
         hold_network(self, actor_network, keep_reference=True)
         self.clip, self.kl, self.entropy = clip, kl, entropy
-        clipped = [] if clip is None else ["clipped", "ratio"]
-        self.out_keys = ["loss_policy", "loss_kl", "loss_entropy", "kl", "entropy", "nll", *clipped]
+        clipped = [] if clip is None else ["clip_fraction"]
+        self.out_keys = ["loss_objective", "loss_kl_to_ref", "loss_entropy", "kl", "entropy", "nll", *clipped]
 
     @property
     def in_keys(self) -> list[NestedKey]:
         """Where the input lies, in the order in which plain tensors are taken."""
         accepted = self.tensor_keys
         read = [accepted.context, accepted.tokens, accepted.token_valid, accepted.advantage]
-        return read if self.clip is None else [*read, accepted.old_log_prob]
+        return read if self.clip is None else [*read, accepted.sample_log_prob]
 
     def _forward_value_estimator_keys(self, **_: object) -> None:
         """There is no value estimator."""
@@ -133,25 +134,26 @@ class PolicyGradientLoss(LossModule):
         logits = logits_under(self.actor_network_params, self.actor_network, batch)
         log_prob = token_log_prob(logits, tokens)
         gain, diagnostics = self._gain(log_prob, tensordict)
-        drift = masked_mean(token_divergence(logits, reference_logits(self, batch)), valid)
-        entropy = masked_mean(token_entropy(logits), valid)
+        with torch.set_grad_enabled(self.kl > 0 and torch.is_grad_enabled()):
+            drift = masked_mean(token_divergence(logits, reference_logits(self, batch)), valid)
+        with torch.set_grad_enabled(self.entropy > 0 and torch.is_grad_enabled()):
+            entropy = masked_mean(token_entropy(logits), valid)
         diagnostics |= {"kl": drift, "entropy": entropy, "nll": masked_mean(-log_prob, valid)}
         out = {
-            "loss_policy": -masked_mean(gain, valid),
-            "loss_kl": self.kl * drift,
+            "loss_objective": -masked_mean(gain, valid),
+            "loss_kl_to_ref": self.kl * drift,
             "loss_entropy": -self.entropy * entropy,
             **{name: value.detach() for name, value in diagnostics.items()},
         }
         return TensorDict(out, batch_size=[])
 
     def _gain(self, log_prob: Tensor, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """``[S, K, A, T]`` that is to become large, and what is told of the ratios."""
+        """``[S, K, A, T]`` that is to become large, and what is told of the clip."""
         accepted = self.tensor_keys
         advantage = tensordict[accepted.advantage]
         if self.clip is None:
             return advantage * log_prob, {}
-        ratio = (log_prob - tensordict[accepted.old_log_prob]).exp()
+        ratio = (log_prob - tensordict[accepted.sample_log_prob]).exp()
         free, held = advantage * ratio, advantage * ratio.clamp(1 - self.clip, 1 + self.clip)
-        valid = tensordict[accepted.token_valid]
-        told = {"clipped": masked_mean((held < free).to(ratio.dtype), valid), "ratio": masked_mean(ratio, valid)}
-        return torch.minimum(free, held), told
+        share = masked_mean((held < free).to(ratio.dtype), tensordict[accepted.token_valid])
+        return torch.minimum(free, held), {"clip_fraction": share}

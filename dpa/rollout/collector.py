@@ -49,7 +49,7 @@ class RolloutCollector(BaseCollector):
     def __init__(self, job: RolloutJob, tasks: Sequence[RolloutTask], workers: Workers | None = None) -> None:
         super().__init__()
         self.job, self.tasks, self.workers = job, list(tasks), workers or Workers()
-        self._next = 0
+        self._next, self._hold = 0, len(self.tasks)
         self._weights: Mapping[str, Tensor] | None = None
         self._crew: Crew | None = None
 
@@ -61,6 +61,8 @@ class RolloutCollector(BaseCollector):
         try:
             self._begin()
             while self._next < len(self.tasks):
+                if self._next >= self._hold:
+                    raise ValueError(f"the collector is held at task {self._hold}; say hold_at with a later one first.")
                 while self._next not in self._made:
                     self._feed()
                     self._take(*self._crew.wait())
@@ -85,7 +87,7 @@ class RolloutCollector(BaseCollector):
 
     def _feed(self) -> None:
         """Give the first tasks that wait to those who have none, not too far ahead of the next batch."""
-        last = self._next + AHEAD * self._crew.size
+        last = min(self._next + AHEAD * self._crew.size, self._hold)
         while self._idle and self._waiting and self._waiting[0] < last:
             worker, number = self._idle.pop(), heappop(self._waiting)
             self._running[worker] = number, self._version
@@ -143,6 +145,14 @@ class RolloutCollector(BaseCollector):
             raise ValueError(f"weights {sorted(given.keys() - known.keys())[:3]} are none of the model's.")
         self._weights = {name: value.detach().clone() for name, value in (known | dict(given)).items()}
         self._changed()
+
+    def hold_at(self, task: int) -> None:
+        """Hand out no task from this one on, until told otherwise: workers would do it with weights of the past.
+
+        Args:
+            task: its number.
+        """
+        self._hold = task
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seed the rollouts from the next batch on; returns the seed."""

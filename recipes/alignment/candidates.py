@@ -194,13 +194,7 @@ def _choose(data: DictConfig, store: PreferenceStore, rows: list[int], seed: int
         return [Chosen(each, each) for each in drawn]
     distance = (store.distance if data.rank_by == keys.DISTANCE else store.ade)[rows]
     if data.kind == "pairs":
-        chosen = choose_pairs(data, distance, seed)
-        if data.margin and not any(len(each.preferred) for each in chosen):
-            raise ValueError(
-                f"method.data.margin={data.margin} leaves no pair: none differs by this share of its scene's mean "
-                "distance; lower it."
-            )
-        return chosen
+        return _choose_pairs(data, distance, seed)
     order = nearest(distance, distance.shape[-1])
     if data.kind == "best":
         sides = order[:, : data.num], order[:, :0]
@@ -213,27 +207,21 @@ def _choose(data: DictConfig, store: PreferenceStore, rows: list[int], seed: int
     return [Chosen(*each) for each in zip(*sides, strict=True)]
 
 
-def choose_pairs(data: DictConfig, distance: Tensor, seed: int, *draw: int) -> list[Chosen]:
-    """Pairs among the rollouts of some scenes.
-
-    Args:
-        data: of a method, with ``pairs``, ``num``, ``margin`` and ``rankings_per_scene``.
-        distance: ``[S, K]`` that ranks them.
-        seed: of what is drawn.
-        draw: what tells several draws of one seed apart.
-
-    Returns:
-        Of each scene, its pairs that the margin leaves; there may be none.
-    """
+def _choose_pairs(data: DictConfig, distance: Tensor, seed: int) -> list[Chosen]:
     if data.pairs == "nearest_farthest":
         preferred, unpreferred = nearest_farthest(distance, data.num)
     elif data.pairs == "random":
-        preferred, unpreferred = random_pairs(distance, data.num, make_generator(seed, "random_pairs", *draw))
+        preferred, unpreferred = random_pairs(distance, data.num, make_generator(seed, "random_pairs"))
     else:
         preferred, unpreferred = all_pairs(distance)
     kept = separated(distance, preferred, unpreferred, data.margin, relative=True)
+    if not kept.any():
+        raise ValueError(
+            f"method.data.margin={data.margin} leaves no pair: none differs by this share of its scene's mean "
+            "distance; lower it."
+        )
     if data.rankings_per_scene is not None:
-        kept = thin_out(kept, data.rankings_per_scene, make_generator(seed, "rankings", *draw))
+        kept = thin_out(kept, data.rankings_per_scene, make_generator(seed, "rankings"))
     return [Chosen(near[pairs], far[pairs]) for near, far, pairs in zip(preferred, unpreferred, kept, strict=True)]
 
 

@@ -36,18 +36,16 @@ RANKED = ("pairs", "best", "sets", "ranking", "own_pairs")
 """Those of them that read ranks."""
 PAIRED = ("pairs", "own_pairs")
 """Those of them that pair rollouts by rank."""
-PAIRING = ("rank_by", "pairs", "num", "margin", "rankings_per_scene")
-ROLLING = ("num_rollouts", "decoding", "ranking")
 READ = {
-    "pairs": PAIRING,
+    "pairs": ("rank_by", "pairs", "num", "margin", "rankings_per_scene"),
     "best": ("rank_by", "num"),
     "sets": ("rank_by", "num", "num_unpreferred"),
     "ranking": ("rank_by", "num"),
     "adversarial": ("num",),
     "expert": ("num",),
     "closed_loop": ("candidates", "recovery"),
-    "own_pairs": (*ROLLING, *PAIRING),
-    "own_groups": (*ROLLING, "rewards", "baseline", "scale", "passes"),
+    "own_pairs": ("num_rollouts", "decoding", "ranking", "rank_by", "pairs", "num"),
+    "own_groups": ("num_rollouts", "ranking", "rewards", "baseline", "scale", "passes"),
 }
 """Options of each beside ``kind``."""
 PAIRS = ("nearest_farthest", "random", "all")
@@ -77,7 +75,7 @@ def num_candidates(data: DictConfig, held: int) -> tuple[int, int]:
         whole = data.num or held
         return (whole + 1) // 2, whole // 2
     num = held * (held - 1) // 2 if data.kind in PAIRED and data.pairs == "all" else data.num
-    if data.kind in PAIRED and data.rankings_per_scene is not None:
+    if data.kind == "pairs" and data.rankings_per_scene is not None:
         num = min(num, max(1, int(data.rankings_per_scene)))  # of half a pair in the mean, a scene has one or none
     return num, {"best": 0, "sets": data.get("num_unpreferred")}.get(data.kind, num)
 
@@ -122,7 +120,9 @@ def check_rolling(data: DictConfig) -> tuple[Decoding, Distance]:
         raise ValueError(
             f"method.data.num_rollouts must be 2 or more, got {data.num_rollouts!r}: a rollout is ranked among others."
         )
-    decoding = build(Decoding, data.decoding, "method.data.decoding")
+    # A policy gradient is one of rollouts that are drawn from the policy itself.
+    own = {"top_p": 1.0} if data.kind == "own_groups" else data.decoding
+    decoding = build(Decoding, OmegaConf.create(own), "method.data.decoding")
     return decoding, build_distance(data.ranking, "method.data.ranking")
 
 
@@ -163,7 +163,7 @@ def _check(data: DictConfig, held: int, given: DictConfig) -> None:
                 f"method.data.pairs=all takes every pair, and {_asked(given, data, 'num')} asks for some; say "
                 "method.data.num=null, and rankings_per_scene to keep fewer."
             )
-        return _check_pairs(data, held * (held - 1) // 2)
+        return _check_pairs(data, held * (held - 1) // 2) if data.kind == "pairs" else None
     if data.kind == "ranking" and data.num is None:
         return None
     for name in ("num", "num_unpreferred") if data.kind == "sets" else ("num",):
@@ -174,7 +174,7 @@ def _check(data: DictConfig, held: int, given: DictConfig) -> None:
         if data[name] < 1:
             raise ValueError(f"method.data.{name} must be 1 or more, got {data[name]}.")
     _check_enough(data, held, given)
-    return _check_pairs(data, data.num) if data.kind in PAIRED else None
+    return _check_pairs(data, data.num) if data.kind == "pairs" else None
 
 
 def _check_read(data: DictConfig) -> None:

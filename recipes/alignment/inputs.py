@@ -14,7 +14,7 @@ from dpa.preferences import PreferenceStore
 from envs.progress import message
 from envs.store import SceneStore
 from recipes.alignment.candidates import Candidates, make_candidates
-from recipes.alignment.data import SIDES
+from recipes.alignment.data import ROLLED, SIDES
 from recipes.alignment.watch import ImitationLook, Look, Watch
 from recipes.common.cli import deciding, plain
 from recipes.common.models import open_policy, weights_digest
@@ -101,7 +101,7 @@ class Inputs:
         return {
             "data": plain(method.data),
             "loss": plain(method.loss),
-            "alignment": deciding(alignment, *OBSERVING),
+            "alignment": deciding(alignment, *OBSERVING, *(("pairs_per_scene",) if method.data.kind in ROLLED else ())),
             "scenes": fingerprint(self.scenes.subset(self.learnt)),
             "seed": seed,
             "reference": weights_digest(self.model),

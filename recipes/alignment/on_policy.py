@@ -17,7 +17,8 @@ from torch.nn import functional as F
 
 from dpa.policy import ContextOptions, MotionLM, SceneContext
 from dpa.policy.actor import Contexts
-from dpa.preferences import agent_preference
+from dpa.preferences import agent_preference, all_pairs, nearest_farthest, random_pairs
+from dpa.ranking import Distance
 from dpa.ranking.transform import RankRollouts
 from dpa.rewards import advantages, reward_of
 from dpa.rollout import RolloutCollector, RolloutJob, RolloutTask, Workers, plan_tasks
@@ -27,20 +28,27 @@ from dpa.training.distributed import ALONE, Ranks
 from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
 from envs import keys
 from envs.scene import SceneSource
-from recipes.alignment.candidates import Group, choose_pairs
+from envs.seeding import make_generator
+from recipes.alignment.candidates import Group
 from recipes.alignment.data import check_data, check_rolling
 from recipes.alignment.draws import Draw, make_batch
 from recipes.common.cli import build, plain
+
+OF_AGENTS = {keys.TOKENS: -2, keys.SAMPLE_LOG_PROB: -2, keys.TOKEN_VALID: -2, keys.AGENT_DISTANCE: -1,
+             keys.AGENT_RANKED: -1, keys.AGENT_KIND: -1}  # fmt: skip
+"""Entries of a ranked group with one row for each agent, and the dimension of these rows."""
 
 
 class Rolled(NamedTuple):
     """What a step has rolled out of one scene.
 
     Attributes:
+        scene: index.
         context: uncollated.
-        ranked: its group, of batch size ``[]`` and cut to its own A agents.
+        ranked: its group, of batch size ``[]`` and cut to its own A agents, on the CPU.
     """
 
+    scene: int
     context: SceneContext
     ranked: TensorDict
 
@@ -55,7 +63,7 @@ class OnPolicyStep:
 
     Rollouts come from a :class:`~dpa.rollout.RolloutCollector` with the weights of the moment, ranking is its
     post-processing. What a step draws depends on its number, the seed and the weights alone, so that a run that goes
-    on does what it would have done.
+    on does what it would have done, on any number of ranks. A scene that a step has twice counts twice.
 
     Args:
         model: to align.
@@ -94,12 +102,12 @@ class OnPolicyStep:
         self.optimizer = make_optimizer(model, options.lr, options.weight_decay)
         self.schedule = make_schedule(self.optimizer, self.passes * options.steps, self.passes * options.warmup)
         order = ShuffledOrder(len(scenes), options.scenes_per_step, seed)
-        steps = [ranks.mine(order(step)) for step in range(options.steps)]
+        self.scenes = [ranks.mine(order(step)) for step in range(options.steps)]
         workers = build(Workers, options.workers, "alignment.workers")
         most = rows_within(options.memory, model, context)
-        sizes = [agents_of(scenes, some, context) for some in steps]
+        sizes = [agents_of(scenes, some, context) for some in self.scenes]
         tasks = [tasks_of(step, each, data.num_rollouts, most, workers.count) for step, each in enumerate(sizes)]
-        self._ends = list(accumulate(len(each) for each in tasks))
+        self._ends = list(accumulate((len(each) for each in tasks), initial=0))
         decoding, distance = check_rolling(data)
         job = RolloutJob(
             scenes,
@@ -108,7 +116,7 @@ class OnPolicyStep:
             decoding=decoding,
             options=context,
             seed=seed,
-            make_postproc=partial(Ranked, num_rollouts=data.num_rollouts, distance=distance),
+            make_postproc=partial(RankSampled, num_rollouts=data.num_rollouts, distance=distance),
             device=device,
         )
         self.collector = RolloutCollector(job, [task for each in tasks for task in each], workers)
@@ -128,16 +136,17 @@ class OnPolicyStep:
         start = time.perf_counter()
         rolled = self._roll_out(step)
         told, before = self._told(rolled), time.perf_counter()
+        parts = self._groups if self.data.kind == "own_groups" else partial(self._pairs, step=step)
         for _ in range(self.passes):
-            figures = accumulate_gradients(self.loss, self._parts(rolled, step), self.ranks)
+            figures = accumulate_gradients(self.loss, parts(rolled), self.ranks)
             norm = clip_and_step(self.optimizer, self.options.max_norm, self.schedule)
         took = {"seconds_rollout": before - start, "seconds_learning": time.perf_counter() - before}
         return {**figures, "gradient_norm": norm, **told, **took}
 
     def _roll_out(self, step: int) -> list[Rolled]:
         """The groups of this rank's scenes, by the weights of the moment."""
-        last = self._ends[step]
-        first = self._ends[step - 1] if step else 0
+        first, last = self._ends[step : step + 2]
+        self.collector.hold_at(last)  # what comes after waits for what this step learns
         if self._batches is None:
             self.collector.load_state_dict({"next": first, "seed": self.seed})
             self._batches = iter(self.collector)
@@ -145,15 +154,15 @@ class OnPolicyStep:
         groups = [group for _ in range(first, last) for group in next(self._batches)]
         if last == self._ends[-1]:
             self.collector.shutdown()
-        return [self._of_scene(group) for group in groups]
+        rolled = {each.scene: each for each in map(self._of_scene, groups)}
+        return [rolled[scene] for scene in self.scenes[step]]
 
     def _of_scene(self, ranked: TensorDictBase) -> Rolled:
-        context = self.contexts[int(ranked[keys.SCENE])]
-        agents = len(context.kind)
-        of_agents = (keys.TOKENS, keys.OLD_LOG_PROB, keys.TOKEN_VALID)
-        cut = {key: ranked[key][..., :agents, :] for key in of_agents}
-        cut[keys.AGENT_DISTANCE] = ranked[keys.AGENT_DISTANCE][..., :agents]
-        return Rolled(context, TensorDict({**cut, **{key: ranked[key] for key in (keys.DISTANCE, keys.ADE)}}))
+        scene, ranked = int(ranked[keys.SCENE]), ranked.cpu()
+        context = self.contexts[scene]
+        for key, agents in OF_AGENTS.items():
+            ranked[key] = ranked[key].narrow(agents, 0, len(context.kind))
+        return Rolled(scene, context, ranked)
 
     def _told(self, rolled: list[Rolled]) -> dict[str, float]:
         """Means over the rollouts of all ranks."""
@@ -162,50 +171,65 @@ class OnPolicyStep:
         *totals, count = self.ranks.sum(torch.tensor([*sums, len(rolled)], dtype=torch.float64)).tolist()
         return {name: total / count for name, total in zip(named, totals, strict=True)}
 
-    def _parts(self, rolled: list[Rolled], step: int) -> Iterator[tuple[TensorDict, float]]:
-        if self.data.kind == "own_groups":
-            return self._groups(rolled)
-        return self._pairs(rolled, step)
-
     def _groups(self, rolled: list[Rolled]) -> Iterator[tuple[TensorDict, float]]:
-        """Whole groups of scenes of similar size, each part with its share of the tokens of all ranks."""
-        weights = plain(self.data.rewards)
-        graded = [
-            (one, advantages(reward_of(one.ranked[None], weights), baseline=self.data.baseline, scale=self.data.scale))
-            for one in with_tokens(rolled)
-        ]
-        tokens = [int(one.token_valid.sum()) for one, _ in graded]
+        """Rollouts with their advantages, each part with its share of the tokens of all ranks."""
+        rolled, rollouts = with_tokens(rolled), self.data.num_rollouts
+        graded = [self._graded(one) for one in rolled]
+        tokens = [int(one.token_valid.sum()) for one in rolled]
         total = max(1, int(self.ranks.sum(torch.tensor(sum(tokens)))))
-        for part in micro_batches(
-            [one.ranked[keys.TOKENS][..., 0].numel() for one, _ in graded], self.options.max_rows
-        ):
-            yield group_batch([graded[i] for i in part]).to(self.device), sum(tokens[i] for i in part) / total
+        for rows, some in parts_within([len(one.token_valid) for one in rolled], rollouts, self.options.max_rows):
+            share = sum(tokens[row] for row in rows) * len(some) / rollouts / total
+            yield group_batch([(rolled[row], graded[row]) for row in rows], some).to(self.device), share
+
+    def _graded(self, one: Rolled) -> Tensor:
+        """``[K, A or 1]``: advantages of a scene's rollouts."""
+        reward = reward_of(one.ranked[None], plain(self.data.rewards))
+        return advantages(reward, baseline=self.data.baseline, scale=self.data.scale)[0]
 
     def _pairs(self, rolled: list[Rolled], step: int) -> Iterator[tuple[TensorDict, float]]:
-        """Pairs of scenes of similar size, each part with its share of the scenes of all ranks that have any."""
-        ranked_by = torch.stack([one.ranked[self.data.rank_by] for one in rolled])
-        chosen = choose_pairs(self.data, ranked_by, self.seed, step, self.ranks.rank)
-        groups = [
-            paired(one, near, far, self.data)
-            for one, (near, far) in zip(rolled, chosen, strict=True)
-            if len(near) and one.token_valid.any()
-        ]
-        total = max(1, int(self.ranks.sum(torch.tensor(len(groups)))))
-        if not groups:  # the other ranks wait for a pass of this one
-            near, far = torch.tensor([0]), torch.tensor([1])
-            yield make_batch([_all_of(paired(rolled[0], near, far, self.data))]).to(self.device), 0.0
-        for part in micro_batches([group.preferred[..., 0].numel() for group in groups], self.options.max_rows):
-            yield make_batch([_all_of(groups[i]) for i in part]).to(self.device), len(part) / total
+        """Pairs of rollouts, each part with its share of those of all ranks."""
+        groups = [self._paired(one, step) for one in with_tokens(rolled)]
+        counted = sum(bool(group.token_valid.any()) for group in groups)
+        total, num = max(1, int(self.ranks.sum(torch.tensor(counted)))), len(groups[0].preferred)
+        for rows, some in parts_within([len(group.token_valid) for group in groups], num, self.options.max_rows):
+            pairs = torch.arange(some.start, some.stop)
+            batch = make_batch([Draw(groups[row], pairs, pairs) for row in rows]).to(self.device)
+            yield batch, (counted > 0) * len(rows) * len(some) / num / total
+
+    def _paired(self, one: Rolled, step: int) -> Group:
+        """Pairs of one scene's rollouts, as many as of any other."""
+        data, tokens, say = self.data, one.ranked[keys.TOKENS], None
+        by = one.ranked[data.rank_by][None]
+        if data.pairs == "nearest_farthest":
+            near, far = nearest_farthest(by, data.num)
+        elif data.pairs == "random":
+            near, far = random_pairs(by, data.num, make_generator(self.seed, "random_pairs", step, one.scene))
+        else:
+            near, far = all_pairs(by)
+        if data.rank_by == keys.DISTANCE:
+            say = agent_preference(one.ranked[keys.AGENT_DISTANCE][None], near, far)[0]
+        return Group(one.context, tokens[near[0]], tokens[far[0]], one.token_valid, say)
 
 
-class Ranked(RankRollouts):
-    """Ranked groups that know how likely their tokens were when they were drawn, ``[S, K, A, T]`` [nats]."""
+class RankSampled(RankRollouts):
+    """Ranked groups with the log-probabilities by which their tokens were drawn, ``[S, K, A, T]`` [nats].
+
+    Args:
+        scenes: where the environment's scenes come from.
+        num_rollouts: K.
+        distance: how rollouts are compared.
+    """
+
+    def __init__(self, scenes: SceneSource, num_rollouts: int, distance: Distance) -> None:
+        super().__init__(scenes, num_rollouts, distance)
+        self.in_keys = [*self.in_keys, keys.SAMPLING_LOG_PROB]
+        self.out_keys = [*self.out_keys, keys.SAMPLE_LOG_PROB]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Rank every group: ``[S * K, T]`` -> ``[S]``."""
         groups = super().forward(tensordict)
-        likely = tensordict[keys.LOG_PROB].unflatten(0, (-1, self.num_rollouts))
-        groups[keys.OLD_LOG_PROB] = likely.movedim(2, -1)
+        likely = tensordict[keys.SAMPLING_LOG_PROB].unflatten(0, (-1, self.num_rollouts))
+        groups[keys.SAMPLE_LOG_PROB] = likely.movedim(2, -1)
         return groups
 
 
@@ -214,47 +238,61 @@ def tasks_of(step: int, sizes: dict[int, int], num_rollouts: int, most: int, wor
 
     Args:
         step: counted from 0.
-        sizes: scenes and their agents; one that a step has twice is rolled out once.
+        sizes: scenes and their agents.
         num_rollouts: K.
         most: agents times rollouts that run side by side.
-        workers: each of whom is to have a part.
+        workers: that share the scenes of the step, as far as there are as many.
 
     Examples:
         >>> tasks_of(2, {7: 3}, num_rollouts=4, most=100)
         [RolloutTask(scenes=(7,), pieces=(range(8, 12),))]
+        >>> [task.scenes for task in tasks_of(0, {0: 3, 1: 3, 2: 4}, num_rollouts=4, most=100, workers=3)]
+        [(0,), (1,), (2,)]
     """
     shift, rows = step * num_rollouts, num_rollouts * sum(sizes.values())
-    most = min(most, max(1, -(-rows // workers)))
+    most = min(most, max(-(-rows // workers), num_rollouts * max(sizes.values())))
     return [
         replace(task, pieces=tuple(range(piece.start + shift, piece.stop + shift) for piece in task.pieces))
         for task in plan_tasks(sizes, num_rollouts, most)
     ]
 
 
-def group_batch(graded: Sequence[tuple[Rolled, Tensor]]) -> TensorDict:
-    """A batch of whole groups with their advantages, for :class:`~dpa.losses.PolicyGradientLoss`."""
-    batch = collate_items([Item(one.context, one.ranked[keys.TOKENS], one.token_valid) for one, _ in graded])
+def parts_within(agents: Sequence[int], rollouts: int, max_rows: int) -> Iterator[tuple[list[int], range]]:
+    """Rollouts of scenes that are passed together: those of small scenes side by side, those of large ones in parts.
+
+    Args:
+        agents: of each scene.
+        rollouts: of each scene.
+        max_rows: bound on rollouts times agents; one rollout of a scene may exceed it.
+
+    Returns:
+        Scenes, by their place, and which of their rollouts.
+
+    Examples:
+        >>> list(parts_within([2, 9, 2], rollouts=4, max_rows=18))
+        [([0, 2], range(0, 4)), ([1], range(0, 2)), ([1], range(2, 4))]
+    """
+    for rows in micro_batches([each * rollouts for each in agents], max_rows):
+        most = max(1, max_rows // max(agents[row] for row in rows))
+        for first in range(0, rollouts, most):
+            yield rows, range(first, min(first + most, rollouts))
+
+
+def group_batch(graded: Sequence[tuple[Rolled, Tensor]], some: range) -> TensorDict:
+    """A batch for :class:`~dpa.losses.PolicyGradientLoss`.
+
+    Args:
+        graded: scenes with the advantages ``[K, A or 1]`` of all their rollouts.
+        some: the rollouts that are in the batch.
+    """
+    part = slice(some.start, some.stop)
+    batch = collate_items([Item(one.context, one.ranked[keys.TOKENS][part], one.token_valid) for one, _ in graded])
     agents = batch[keys.TOKENS].shape[2]
-    del batch[keys.LABELS]
 
     def padded(value: Tensor) -> Tensor:
         """``[K, A, ...]`` with as many agents as the batch."""
         return F.pad(value, (0, 0, 0, agents - value.shape[1]))
 
-    batch[keys.OLD_LOG_PROB] = torch.stack([padded(one.ranked[keys.OLD_LOG_PROB]) for one, _ in graded])
-    each = [advantage[0][..., None].expand(-1, len(one.token_valid), -1) for one, advantage in graded]
-    batch[keys.ADVANTAGE] = torch.stack([padded(advantage) for advantage in each])
-    return batch
-
-
-def paired(one: Rolled, near: Tensor, far: Tensor, data: DictConfig) -> Group:
-    """Pairs of one scene's rollouts."""
-    tokens, say = one.ranked[keys.TOKENS], None
-    if data.rank_by == keys.DISTANCE:
-        say = agent_preference(one.ranked[keys.AGENT_DISTANCE][None], near[None], far[None])[0]
-    return Group(one.context, tokens[near], tokens[far], one.token_valid, say)
-
-
-def _all_of(group: Group) -> Draw:
-    every = torch.arange(len(group.preferred))
-    return Draw(group, every, every)
+    likely = [padded(one.ranked[keys.SAMPLE_LOG_PROB][part]) for one, _ in graded]
+    each = [padded(value[part, :, None].expand(-1, len(one.token_valid), -1)) for one, value in graded]
+    return batch.update({keys.SAMPLE_LOG_PROB: torch.stack(likely), keys.ADVANTAGE: torch.stack(each)})

@@ -64,7 +64,7 @@ LIMITS: dict[str, Limit] = {
     **dict.fromkeys(("compile", "arrivals", "tokenized", "loss.reference"), FLAG),
     **dict.fromkeys(("output", "policy", "preferences"), Limit(str)),
     **dict.fromkeys(("show", "years"), Limit(list)),
-    **dict.fromkeys(("rankings", "bins", "tokenizer", "setup", "labels", "published"), Limit(dict)),
+    **dict.fromkeys(("rankings", "rewards", "bins", "tokenizer", "setup", "labels", "published"), Limit(dict)),
     **dict.fromkeys(BINS, POSITIVE._replace(many=True)),
     "grid": Limit(float, many=True),
     "start": Limit(str, empty=True),

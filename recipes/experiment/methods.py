@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from dpa.report.table import REFERENCE
 from envs.seeding import derive_seed
-from recipes.alignment.data import RANKED
+from recipes.alignment.data import ON_POLICY, RANKED
 from recipes.common.cli import build
 from recipes.experiment.runs import SNAPSHOT
 
@@ -119,6 +119,11 @@ def read_setups(cfg: DictConfig) -> dict[str, Setup]:
             raise ValueError(
                 f"experiment.setup.{name}.ranking={setup.ranking} says nothing to methods.{name}.data.kind="
                 f"{cfg.methods[name].data.kind}, which reads no ranks; leave it out."
+            )
+        if setup.ranking is not None and cfg.methods[name].data.kind in ON_POLICY:
+            raise ValueError(
+                f"experiment.setup.{name}.ranking={setup.ranking} is for rollouts of a store, and {name} ranks those "
+                f"that it makes; say methods.{name}.data.ranking."
             )
     return {name: setups[name] for level in levels(setups) for name in level}
 

@@ -73,13 +73,13 @@ def test_the_advantages_of_a_group_sum_to_nothing_and_keep_its_order(values: obj
 @given(GROUPS, st.floats(0.5, 20), st.floats(-50, 50))
 def test_scaled_advantages_do_not_depend_on_the_unit_of_a_reward(values: object, unit: float, shift: float) -> None:
     reward = torch.from_numpy(values).double()
-    plain, other = (advantages(each, baseline="mean") for each in (reward, unit * reward + shift))
+    plain, other = (advantages(each, baseline="mean", scale="group") for each in (reward, unit * reward + shift))
     spread = reward.std(1, keepdim=True) * min(1.0, unit)
     assert torch.allclose(plain, other, atol=1e-6) or (spread < SMALLEST_SPREAD).any()
 
 
 def test_rollouts_that_are_as_good_as_equal_teach_nothing() -> None:
-    assert not advantages(torch.tensor([[2.0, 2.0 + 1e-5, 2.0]])).any()
+    assert not advantages(torch.tensor([[2.0, 2.0 + 1e-5, 2.0]]), scale="group").any()
 
 
 @pytest.mark.parametrize(

@@ -178,6 +178,14 @@ def test_a_method_comes_after_those_that_it_starts_from_or_learns_from() -> None
             ("experiment=losses", "~experiment.setup.afd_expert"),
             "methods.afd_expert.data.kind=expert .* say whose: experiment.setup.afd_expert.expert=METHOD",
         ),
+        (
+            (
+                "+method@methods.own=dpa_omf_on_policy",
+                "+rankings.far={stride:5}",
+                "+experiment.setup.own={ranking:far}",
+            ),
+            "own ranks those that it makes; say methods.own.data.ranking",
+        ),
         (("collection.ranking.stride=0",), "collection.ranking.stride must be 1 or more, got 0"),
         (("evaluation.num_rollouts=0",), "evaluation.num_rollouts must be 1 or more, got 0"),
         (("experiment.name=a/b",), "experiment.name='a/b' names a file and a place on the page"),

@@ -58,11 +58,24 @@ def test_a_policy_gradient_comes_nearer_to_the_log(
     assert sum(distances[-5:]) < 0.9 * sum(distances[:5])
 
 
-def test_rows_of_a_pass_change_rounding_alone(run: Callable, options: Callable, origin: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("method", METHODS)
+def test_rows_of_a_pass_change_rounding_alone(
+    run: Callable, options: Callable, origin: Path, tmp_path: Path, method: str
+) -> None:
     for name, rows in (("one", 1), ("all", 999)):
-        outcome = run("align", *aligning(options, origin, "rloo", tmp_path / name, f"alignment.max_rows={rows}"))
+        outcome = run("align", *aligning(options, origin, method, tmp_path / name, f"alignment.max_rows={rows}"))
         assert outcome.status == 0, outcome.err
     assert_same(tmp_path / "one", tmp_path / "all", atol=1e-5)
+
+
+@pytest.mark.parametrize("pairs", [["pairs=random"], ["pairs=all", "num=null"], ["rank_by=ade"]])
+def test_pairs_of_its_own_may_be_any(
+    run: Callable, options: Callable, origin: Path, tmp_path: Path, pairs: list[str]
+) -> None:
+    more = [f"method.data.{option}" for option in pairs]
+    outcome = run("align", *aligning(options, origin, "dpa_omf_on_policy", tmp_path, "alignment.steps=2", *more))
+    assert outcome.status == 0, outcome.err
+    assert len(read_curve(tmp_path, "train/loss_preference")) == 2
 
 
 @pytest.mark.slow
@@ -110,7 +123,14 @@ def test_no_two_steps_roll_out_by_the_same_draws_and_all_workers_have_a_part() -
         ("rloo", ["+method.data.rewards.speed=1"], "there is no reward 'speed'"),
         ("rloo", ["method.data.rewards.ade=much"], "method.data.rewards.ade must be a number, got 'much'"),
         ("rloo", ["method.data.baseline=none"], "method.data.baseline must be leave_one_out or mean, got 'none'"),
-        ("rloo", ["method.data.decoding.top_p=0"], "top_p"),
+        ("rloo", ["method.data.rewards=ade"], "method.data.rewards must be a section, got 'ade'"),
+        (
+            "rloo",
+            ["+method.data.decoding.top_p=0.9"],
+            "method.data.decoding says nothing to method.data.kind=own_groups",
+        ),
+        ("dpa_omf_on_policy", ["method.data.decoding.top_p=0"], "top_p must be above 0, got 0"),
+        ("dpa_omf_on_policy", ["+method.data.margin=0.1"], "method.data.margin says nothing"),
         ("rloo", ["method.data.ranking.features=all"], "unknown feature set 'all'"),
         ("rloo", ["method.loss.kl=-1"], "method.loss.kl must be 0 or more, got -1"),
         ("rloo", ["~method.data.passes"], "method.data.kind=own_groups needs method.data.passes"),

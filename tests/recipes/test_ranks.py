@@ -177,7 +177,7 @@ def test_two_ranks_roll_out_and_learn_like_one_process(
     status, output = run_ranks(2, "align", *arguments, f"output={tmp_path / 'two'}")
     assert status == 0, output
     assert run("align", *arguments, f"output={tmp_path / 'one'}").status == 0
-    assert_same(tmp_path / "two", tmp_path / "one", ("train/rollout_distance", "train/loss_policy", "train/kl"))
+    assert_same(tmp_path / "two", tmp_path / "one", ("train/rollout_distance", "train/loss_objective", "train/kl"))
 
 
 # --- a kill ---------------------------------------------------------------------------------------------------------

@@ -27,7 +27,7 @@ def groups(batch: TensorDict) -> TensorDict:
     advantage = torch.zeros(1, 2, agents, 1)
     advantage[0, :, :2, 0] = torch.tensor(ADVANTAGE)
     found["advantage"] = advantage
-    return found.set("old_log_prob", torch.full(found["tokens"].shape, -math.log(5.0)))
+    return found.set("sample_log_prob", torch.full(found["tokens"].shape, -math.log(5.0)))
 
 
 def likelihoods(logits: torch.Tensor, tokens: torch.Tensor) -> list[list[float]]:
@@ -44,7 +44,7 @@ def test_without_a_clip_it_is_minus_advantage_times_log_likelihood(network: tupl
         for k, row in enumerate(likelihoods(logits, groups["tokens"]))
         for (agent, _), likely in zip(VALID, row, strict=True)
     ]
-    assert found["loss_policy"].item() == pytest.approx(sum(each) / len(each), abs=1e-5)
+    assert found["loss_objective"].item() == pytest.approx(sum(each) / len(each), abs=1e-5)
     assert found["kl"].item() == pytest.approx(0.0, abs=1e-6)
 
 
@@ -59,8 +59,8 @@ def test_with_a_clip_it_is_the_surrogate_of_ppo(network: tuple, groups: TensorDi
             clipped = advantage * min(max(ratio, 1 - clip), 1 + clip)
             costs.append(-min(ratio * advantage, clipped))
             held.append(clipped < ratio * advantage)
-    assert found["loss_policy"].item() == pytest.approx(sum(costs) / len(costs), abs=1e-5)
-    assert found["clipped"].item() == pytest.approx(sum(held) / len(held))
+    assert found["loss_objective"].item() == pytest.approx(sum(costs) / len(costs), abs=1e-5)
+    assert found["clip_fraction"].item() == pytest.approx(sum(held) / len(held))
 
 
 @pytest.fixture
@@ -94,7 +94,7 @@ def gradients(model: MotionLM, loss: PolicyGradientLoss, batch: TensorDict) -> d
 def test_in_the_first_pass_both_forms_have_the_same_gradient(drawn: TensorDict) -> None:
     model = model_of(0)
     logits = model(drawn["context"], drawn["tokens"], drawn["token_valid"])
-    drawn["old_log_prob"] = logits.log_softmax(-1).gather(-1, drawn["tokens"][..., None])[..., 0].detach()
+    drawn["sample_log_prob"] = logits.log_softmax(-1).gather(-1, drawn["tokens"][..., None])[..., 0].detach()
     free, clipped = (
         gradients(model, PolicyGradientLoss(token_network(model), clip=clip), drawn) for clip in (None, 0.2)
     )
@@ -111,7 +111,7 @@ def test_a_step_makes_good_rollouts_likelier_and_bad_ones_less_likely(drawn: Ten
 
     before = likelihood().detach()
     optimizer = torch.optim.SGD(model.parameters(), 0.05)
-    loss(drawn)["loss_policy"].backward()
+    loss(drawn)["loss_objective"].backward()
     optimizer.step()
     gained = (likelihood() - before).tolist()
     assert gained[0] > 0 > gained[1] and gained[0] > gained[2] > gained[3] > gained[1]

@@ -275,6 +275,27 @@ def test_a_collector_goes_on_where_its_state_was_saved(stepwise: Callable) -> No
         assert torch.equal(batch[keys.TOKEN], expected[keys.TOKEN])
 
 
+@pytest.mark.slow
+def test_tasks_that_are_held_back_are_not_begun_until_they_are_let_go(stepwise: Callable, collect: Callable) -> None:
+    collector, batches = stepwise(PROCESSES), []
+    collector.hold_at(2)
+    iterator = iter(collector)
+    batches += [next(iterator), next(iterator)]
+    assert not collector._running and not collector._made, "no worker is ahead"
+    collector.hold_at(4)
+    batches += iterator
+    assert_same(tokens_of(batches, 2), collect())
+
+
+def test_asking_for_a_task_that_is_held_back_is_an_error(stepwise: Callable) -> None:
+    collector = stepwise()
+    collector.hold_at(1)
+    iterator = iter(collector)
+    next(iterator)
+    with pytest.raises(ValueError, match="the collector is held at task 1; say hold_at with a later one first"):
+        next(iterator)
+
+
 def test_unknown_weights_are_refused(stepwise: Callable) -> None:
     with pytest.raises(ValueError, match=r"weights \['wings'\] are none of the model's"):
         stepwise().update_policy_weights_({"wings": torch.zeros(1)})
