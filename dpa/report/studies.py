@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator, NullLocator
 
 from dpa.report.canvas import CYCLE, INK, QUIET, blank_figure, calm, save_figure
 from dpa.report.statistics import Interval
@@ -69,6 +70,9 @@ def plot_references(
             right.plot([min(nll)] * 2, [value.low, value.high], color=color, lw=1.4, alpha=0.5)
             right.plot(min(nll), value.mean, marker, color=color, ms=6, mec="white", mew=1)
     left.set_xscale("log")
+    left.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    left.xaxis.set_major_formatter("{x:,.0f}")
+    left.xaxis.set_minor_locator(NullLocator())
     left.set_xlabel("step", fontsize=8, color=INK)
     left.set_title("NLL of the tuning scenes, per token [nats]")
     left.legend(frameon=False, fontsize=7, labelcolor=INK)
