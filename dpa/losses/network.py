@@ -6,12 +6,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictParams
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from dpa.policy.precision import Precision, check_precision, running_in
+from envs import keys
 
 CONTEXT = "context"
 LOGITS = "logits"
@@ -44,7 +45,7 @@ def token_network(model: nn.Module, precision: Precision = "float32") -> TensorD
         ValueError: an unknown precision.
     """
     rounded = model if check_precision(precision) == "float32" else _Rounded(model, precision)
-    network = TensorDictModule(rounded, in_keys=[CONTEXT, "tokens", "token_valid"], out_keys=[LOGITS])
+    network = TensorDictModule(rounded, in_keys=[CONTEXT, keys.TOKENS, keys.TOKEN_VALID], out_keys=[LOGITS])
     return network.train(model.training)
 
 
@@ -54,6 +55,13 @@ def hold_network(loss: LossModule, network: TensorDictModule, *, keep_reference:
     if keep_reference:
         # The reference stays as it is: tell torchrl, which warns otherwise, that no updater is missing.
         loss._has_update_associated["actor_network"] = True
+
+
+def network_input(context: TensorDictBase, tokens: Tensor, token_valid: Tensor) -> TensorDict:
+    """What :func:`token_network` reads, of S scenes, under its own keys whatever those of a loss are."""
+    return TensorDict(
+        {CONTEXT: context, keys.TOKENS: tokens, keys.TOKEN_VALID: token_valid}, batch_size=tokens.shape[:1]
+    )
 
 
 def logits_under(parameters: TensorDictParams, network: TensorDictModule, batch: TensorDictBase) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import cross_entropy
 from torchrl.objectives import LossModule
 
-from dpa.losses.network import CONTEXT, hold_network, logits_under, masked_mean, token_entropy
+from dpa.losses.network import CONTEXT, hold_network, logits_under, masked_mean, network_input, token_entropy
 from envs import keys
 
 
@@ -100,10 +100,7 @@ class NextTokenLoss(LossModule):
         """The loss and its diagnostics, each a scalar, of a batch of rollouts."""
         accepted = self.tensor_keys
         tokens, valid = tensordict[accepted.tokens], tensordict[accepted.token_valid]
-        batch = TensorDict(
-            {CONTEXT: tensordict[accepted.context], keys.TOKENS: tokens, keys.TOKEN_VALID: valid},
-            batch_size=tokens.shape[:1],
-        )
+        batch = network_input(tensordict[accepted.context], tokens, valid)
         logits = logits_under(self.actor_network_params, self.actor_network, batch)
         labels = tensordict[accepted.labels]
         each = cross_entropy(

@@ -15,6 +15,7 @@ from dpa.losses.network import (
     hold_network,
     logits_under,
     masked_mean,
+    network_input,
     reference_logits,
     token_divergence,
     token_entropy,
@@ -127,10 +128,7 @@ class PolicyGradientLoss(LossModule):
         """The loss and its diagnostics, each a scalar, of a batch of groups."""
         accepted = self.tensor_keys
         tokens, valid = tensordict[accepted.tokens], tensordict[accepted.token_valid]
-        batch = TensorDict(
-            {CONTEXT: tensordict[accepted.context], keys.TOKENS: tokens, keys.TOKEN_VALID: valid},
-            batch_size=tokens.shape[:1],
-        )
+        batch = network_input(tensordict[accepted.context], tokens, valid)
         logits = logits_under(self.actor_network_params, self.actor_network, batch)
         log_prob = token_log_prob(logits, tokens)
         gain, diagnostics = self._gain(log_prob, tensordict)

@@ -16,6 +16,7 @@ from dpa.losses.network import (
     CONTEXT,
     hold_network,
     logits_under,
+    network_input,
     reference_logits,
     scene_mean,
     token_divergence,
@@ -223,10 +224,7 @@ class PreferenceLoss(LossModule):
         rollouts = tensordict[accepted.preferred], tensordict[accepted.unpreferred]
         tokens, sizes = torch.cat(rollouts, 1), [side.shape[1] for side in rollouts]
         valid = tensordict[accepted.token_valid]
-        batch = TensorDict(
-            {CONTEXT: tensordict[accepted.context], keys.TOKENS: tokens, keys.TOKEN_VALID: valid},
-            batch_size=tokens.shape[:1],
-        )
+        batch = network_input(tensordict[accepted.context], tokens, valid)
         logits = logits_under(self.actor_network_params, self.actor_network, batch)
         reference = reference_logits(self, batch)
         with torch.no_grad():

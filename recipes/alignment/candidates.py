@@ -30,7 +30,7 @@ from dpa.training.logs import log_item
 from envs import keys
 from envs.scene import SceneSource
 from envs.seeding import make_generator
-from recipes.alignment.data import RANKED, SIDES, check_data
+from recipes.alignment.data import PAIRED, RANKED, SIDES, check_data
 
 
 class Group(NamedTuple):
@@ -149,7 +149,7 @@ class Candidates(Sequence[Group]):
         scene = int(self.store.scenes[row])
         context = self.contexts[scene]
         agents = len(context.kind)
-        group = _group(self.data, context, self.store.read([row], num_agents=agents)[0], self.chosen[row])
+        group = group_of(self.data, context, self.store.read([row], num_agents=agents)[0], self.chosen[row])
         if self.data.kind == "adversarial":
             log = log_item(context, self.tokenizer)
             return _against(group, log.tokens.expand(self.data.num, -1, -1), log.token_valid)
@@ -170,11 +170,11 @@ class Candidates(Sequence[Group]):
         return {len(each.preferred) for each in self.chosen.values()}
 
 
-def _group(data: DictConfig, context: SceneContext, ranked: TensorDict, chosen: Chosen) -> Group:
-    """Chosen rollouts of one scene's own group."""
+def group_of(data: DictConfig, context: SceneContext, ranked: TensorDict, chosen: Chosen) -> Group:
+    """Chosen rollouts of one scene's own ranked group, which is cut to its own agents."""
     tokens, valid, say = ranked[keys.TOKENS], ranked[keys.TOKEN_VALID], None
     # Displacement is kept of rollouts as a whole: agents have a preference by the distance only.
-    if data.kind == "pairs" and data.rank_by == keys.DISTANCE:
+    if data.kind in PAIRED and data.rank_by == keys.DISTANCE:
         say = agent_preference(ranked[keys.AGENT_DISTANCE][None], *(side[None] for side in chosen))[0]
     unpreferred = None if data.kind == "best" else tokens[chosen.unpreferred]
     return Group(context, tokens[chosen.preferred], unpreferred, valid, say, SIDES[data.kind])
@@ -207,13 +207,21 @@ def _choose(data: DictConfig, store: PreferenceStore, rows: list[int], seed: int
     return [Chosen(*each) for each in zip(*sides, strict=True)]
 
 
-def _choose_pairs(data: DictConfig, distance: Tensor, seed: int) -> list[Chosen]:
+def pair_up(data: DictConfig, distance: Tensor, draw: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Preferred and unpreferred sides ``[S, M]`` of the pairs that ``data.pairs`` and ``data.num`` ask for.
+
+    Args:
+        data: of a kind in :data:`~recipes.alignment.data.PAIRED`.
+        distance: ``[S, K]`` that ranks the rollouts.
+        draw: of random pairs.
+    """
     if data.pairs == "nearest_farthest":
-        preferred, unpreferred = nearest_farthest(distance, data.num)
-    elif data.pairs == "random":
-        preferred, unpreferred = random_pairs(distance, data.num, make_generator(seed, "random_pairs"))
-    else:
-        preferred, unpreferred = all_pairs(distance)
+        return nearest_farthest(distance, data.num)
+    return random_pairs(distance, data.num, draw) if data.pairs == "random" else all_pairs(distance)
+
+
+def _choose_pairs(data: DictConfig, distance: Tensor, seed: int) -> list[Chosen]:
+    preferred, unpreferred = pair_up(data, distance, make_generator(seed, "random_pairs"))
     kept = separated(distance, preferred, unpreferred, data.margin, relative=True)
     if not kept.any():
         raise ValueError(

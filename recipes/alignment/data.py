@@ -161,7 +161,7 @@ def _check(data: DictConfig, held: int, given: DictConfig) -> None:
         if data.num is not None:
             raise ValueError(
                 f"method.data.pairs=all takes every pair, and {_asked(given, data, 'num')} asks for some; say "
-                "method.data.num=null, and rankings_per_scene to keep fewer."
+                "method.data.num=null" + (", and rankings_per_scene to keep fewer." if data.kind == "pairs" else ".")
             )
         return _check_pairs(data, held * (held - 1) // 2) if data.kind == "pairs" else None
     if data.kind == "ranking" and data.num is None:
@@ -221,6 +221,10 @@ def _check_enough(data: DictConfig, held: int, given: DictConfig) -> None:
         raise ValueError(f"a ranking needs two rollouts, got {asked}; say 2 or more, or null for all.")
     if needed > held:
         raise ValueError(
-            f"{asked} needs {needed} rollouts of a scene and there are {held}; lower it, or collect again with a "
-            "larger collection.num_rollouts."
+            f"{asked} needs {needed} rollouts of a scene and there are {held}; lower it, or "
+            + (
+                "raise method.data.num_rollouts."
+                if data.kind in ROLLED
+                else "collect again with a larger collection.num_rollouts."
+            )
         )

@@ -17,7 +17,6 @@ from torch.nn import functional as F
 
 from dpa.policy import ContextOptions, MotionLM, SceneContext
 from dpa.policy.actor import Contexts
-from dpa.preferences import agent_preference, all_pairs, nearest_farthest, random_pairs
 from dpa.ranking import Distance
 from dpa.ranking.transform import RankRollouts
 from dpa.rewards import advantages, reward_of
@@ -29,7 +28,7 @@ from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimiz
 from envs import keys
 from envs.scene import SceneSource
 from envs.seeding import make_generator
-from recipes.alignment.candidates import Group
+from recipes.alignment.candidates import Chosen, Group, group_of, pair_up
 from recipes.alignment.data import check_data, check_rolling
 from recipes.alignment.draws import Draw, make_batch
 from recipes.common.cli import build, plain
@@ -105,8 +104,11 @@ class OnPolicyStep:
         self.scenes = [ranks.mine(order(step)) for step in range(options.steps)]
         workers = build(Workers, options.workers, "alignment.workers")
         most = rows_within(options.memory, model, context)
-        sizes = [agents_of(scenes, some, context) for some in self.scenes]
-        tasks = [tasks_of(step, each, data.num_rollouts, most, workers.count) for step, each in enumerate(sizes)]
+        agents = agents_of(scenes, None, context)
+        tasks = [
+            tasks_of(step, {scene: agents[scene] for scene in some}, data.num_rollouts, most, workers.count)
+            for step, some in enumerate(self.scenes)
+        ]
         self._ends = list(accumulate((len(each) for each in tasks), initial=0))
         decoding, distance = check_rolling(data)
         job = RolloutJob(
@@ -136,9 +138,9 @@ class OnPolicyStep:
         start = time.perf_counter()
         rolled = self._roll_out(step)
         told, before = self._told(rolled), time.perf_counter()
-        parts = self._groups if self.data.kind == "own_groups" else partial(self._pairs, step=step)
+        parts = list(self._groups(rolled) if self.data.kind == "own_groups" else self._pairs(rolled, step))
         for _ in range(self.passes):
-            figures = accumulate_gradients(self.loss, parts(rolled), self.ranks)
+            figures = accumulate_gradients(self.loss, parts, self.ranks)
             norm = clip_and_step(self.optimizer, self.options.max_norm, self.schedule)
         took = {"seconds_rollout": before - start, "seconds_learning": time.perf_counter() - before}
         return {**figures, "gradient_norm": norm, **told, **took}
@@ -198,17 +200,9 @@ class OnPolicyStep:
 
     def _paired(self, one: Rolled, step: int) -> Group:
         """Pairs of one scene's rollouts, as many as of any other."""
-        data, tokens, say = self.data, one.ranked[keys.TOKENS], None
-        by = one.ranked[data.rank_by][None]
-        if data.pairs == "nearest_farthest":
-            near, far = nearest_farthest(by, data.num)
-        elif data.pairs == "random":
-            near, far = random_pairs(by, data.num, make_generator(self.seed, "random_pairs", step, one.scene))
-        else:
-            near, far = all_pairs(by)
-        if data.rank_by == keys.DISTANCE:
-            say = agent_preference(one.ranked[keys.AGENT_DISTANCE][None], near, far)[0]
-        return Group(one.context, tokens[near[0]], tokens[far[0]], one.token_valid, say)
+        draw = make_generator(self.seed, "random_pairs", step, one.scene)
+        near, far = pair_up(self.data, one.ranked[self.data.rank_by][None], draw)
+        return group_of(self.data, one.context, one.ranked, Chosen(near[0], far[0]))
 
 
 class RankSampled(RankRollouts):

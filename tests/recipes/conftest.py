@@ -117,6 +117,14 @@ def run() -> Callable[..., Outcome]:
 
 
 @pytest.fixture(scope="session")
+def origin(tmp_path_factory: pytest.TempPathFactory, run: Callable, options: Callable) -> Path:
+    """A trained policy."""
+    folder = tmp_path_factory.mktemp("origin")
+    assert run("pretrain", *options("pretrain", f"output={folder}", "pretraining.lr=1e-2")).status == 0
+    return folder / "policy.pt"
+
+
+@pytest.fixture(scope="session")
 def kill_when() -> Callable[..., None]:
     """Starts a recipe in a process of its own and kills it as soon as something is there."""
 

@@ -14,14 +14,6 @@ from dpa.training.loggers import read_curve
 CAT_K = "method=cat_k"
 
 
-@pytest.fixture(scope="module")
-def origin(tmp_path_factory: pytest.TempPathFactory, run: Callable, options: Callable) -> Path:
-    """A trained policy."""
-    folder = tmp_path_factory.mktemp("origin")
-    assert run("pretrain", *options("pretrain", f"output={folder}", "pretraining.lr=1e-2")).status == 0
-    return folder / "policy.pt"
-
-
 def aligning(options: Callable, policy: Path, output: Path, *more: str) -> list[str]:
     return options("align", f"policy={policy}", f"output={output}", CAT_K, *more)
 

@@ -16,14 +16,6 @@ METHODS = ("rloo", "grpo", "dpa_omf_on_policy")
 FEW = ("method.data.num_rollouts=4",)
 
 
-@pytest.fixture(scope="module")
-def origin(tmp_path_factory: pytest.TempPathFactory, run: Callable, options: Callable) -> Path:
-    """A trained policy."""
-    folder = tmp_path_factory.mktemp("origin")
-    assert run("pretrain", *options("pretrain", f"output={folder}", "pretraining.lr=1e-2")).status == 0
-    return folder / "policy.pt"
-
-
 def aligning(options: Callable, policy: Path, method: str, output: Path, *more: str) -> list[str]:
     return options("align", f"method={method}", f"policy={policy}", f"output={output}", *FEW, *more)
 

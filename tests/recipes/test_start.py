@@ -13,14 +13,6 @@ from dpa.training.loggers import read_curve
 from recipes.common.models import digest_of, open_policy
 
 
-@pytest.fixture(scope="module")
-def origin(tmp_path_factory: pytest.TempPathFactory, run: Callable, options: Callable) -> Path:
-    """A trained policy."""
-    folder = tmp_path_factory.mktemp("origin")
-    assert run("pretrain", *options("pretrain", f"output={folder}", "pretraining.lr=1e-2")).status == 0
-    return folder / "policy.pt"
-
-
 def elsewhere(options: Callable, stores: Path, start: object, output: Path, *more: str) -> list[str]:
     """Options of a training on other scenes."""
     command = options("pretrain", f"pretraining.start={start}", f"output={output}", "seed=1", *more)
