@@ -65,6 +65,13 @@ class Coupled(NamedTuple):
     moved: Transport
     """Of ``[R, E]`` problems."""
 
+    @property
+    def paid(self) -> Tensor:
+        """``[R, E, T']``: what each measured step of a rollout pays under the coupling; they sum to the distance."""
+        scaled = (value.double() * self.weights.sqrt() for value in (self.rollouts, self.log))
+        cost = torch.cdist(*scaled, compute_mode="donot_use_mm_for_euclid_dist")
+        return (self.moved.coupling * cost).sum(-1).to(self.rollouts.dtype)
+
 
 class Distance(Protocol):
     """How rollouts of a scene are compared with its log: :class:`PreferenceDistance`, or a function of your own."""

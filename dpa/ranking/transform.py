@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
+from torch.nn.functional import pad
 from torchrl.envs import Transform
 
 from dpa.ranking.distance import Distance, PreferenceDistance, Ranking, rank_of
@@ -14,6 +18,18 @@ from envs.scene import CURRENT_STEP, Scene, SceneSource
 
 PAPER_DISTANCE = PreferenceDistance()
 """All features, the paper's weights, exact transport at 10 Hz, summed over the controlled agents."""
+
+
+class Ranked(NamedTuple):
+    """K rollouts of one scene, as the environment drove them, and their ranking; A agents are present."""
+
+    scene: Scene
+    """Uncollated."""
+    trajectories: Tensor
+    """``[K, A, T * F, 4]`` x, y, z, heading."""
+    controlled: Tensor
+    """``[A]`` bool."""
+    ranking: Ranking
 
 
 class RankRollouts(Transform):
@@ -71,24 +87,37 @@ class RankRollouts(Transform):
         """Rank every group: ``[S * K, T]`` -> ``[S]``."""
         scene, controlled, tokens, poses = self._groups(tensordict)
         ranked = [self._rank(*group) for group in zip(scene.tolist(), poses.cpu(), controlled.cpu(), strict=True)]
-        rankings, kinds = zip(*ranked, strict=True)
-        distance = torch.stack([ranking.distance for ranking in rankings])
         return TensorDict(
             {
                 keys.SCENE: scene,
                 keys.TOKENS: tokens,
                 keys.TOKEN_VALID: controlled[:, :, None].expand(-1, -1, tokens.shape[-1]).clone(),
-                keys.DISTANCE: distance,
-                keys.AGENT_DISTANCE: torch.stack([ranking.agent_distance for ranking in rankings]),
-                keys.ADE: torch.stack([ranking.ade for ranking in rankings]),
-                keys.AGENT_RANKED: torch.stack([ranking.agent_ranked for ranking in rankings]),
-                keys.AGENT_KIND: torch.stack(kinds),
-                keys.FEATURE_SHARE: torch.stack([ranking.feature_share for ranking in rankings]),
-                keys.RANK: rank_of(distance),
+                **self.entries(ranked, controlled.shape[1], tokens.shape[-1]),
             },
-            batch_size=[len(rankings)],
+            batch_size=[len(ranked)],
             device=tensordict.device,
         )
+
+    def entries(self, ranked: Sequence[Ranked], rows: int, decisions: int) -> dict[NestedKey, Tensor]:
+        """What is told of S groups beside their tokens, each ``[S, ...]``; a subclass may tell more.
+
+        Args:
+            ranked: the groups.
+            rows: agents of the environment, padding included.
+            decisions: T.
+        """
+        rankings = [group.ranking for group in ranked]
+        kinds = [group.scene.agents.kind[group.scene.agents.present] for group in ranked]
+        distance = torch.stack([ranking.distance for ranking in rankings])
+        return {
+            keys.DISTANCE: distance,
+            keys.AGENT_DISTANCE: _stacked([ranking.agent_distance for ranking in rankings], rows),
+            keys.ADE: torch.stack([ranking.ade for ranking in rankings]),
+            keys.AGENT_RANKED: _stacked([ranking.agent_ranked for ranking in rankings], rows),
+            keys.AGENT_KIND: _stacked(kinds, rows),
+            keys.FEATURE_SHARE: torch.stack([ranking.feature_share for ranking in rankings]),
+            keys.RANK: rank_of(distance),
+        }
 
     def _groups(self, rollouts: TensorDictBase) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Scene ``[S]``, controlled ``[S, A]``, tokens ``[S, K, A, T]`` and poses ``[S, K, A, T * F, 3]``."""
@@ -127,19 +156,13 @@ class RankRollouts(Transform):
             )
         return one[:, 0, 0]
 
-    def _rank(self, index: int, poses: Tensor, controlled: Tensor) -> tuple[Ranking, Tensor]:
-        """Rank one group, and the kinds ``[A]`` of its agents, padded as in the environment."""
+    def _rank(self, index: int, poses: Tensor, controlled: Tensor) -> Ranked:
+        """Rank one group, without the padding of the environment."""
         scene = self.scenes[index]
         num_agents = self._num_agents(scene, poses.shape[1])
         start = scene.agents.position[scene.agents.present, CURRENT_STEP]
-        trajectories = lift(poses[:, :num_agents], start, scene.road.points)
-        ranking = self.distance(scene, trajectories, controlled[:num_agents])
-        padding = (0, poses.shape[1] - num_agents)
-        padded = ranking._replace(
-            agent_distance=torch.nn.functional.pad(ranking.agent_distance, padding),
-            agent_ranked=torch.nn.functional.pad(ranking.agent_ranked, padding),
-        )
-        return padded, torch.nn.functional.pad(scene.agents.kind[scene.agents.present], padding)
+        trajectories, controlled = lift(poses[:, :num_agents], start, scene.road.points), controlled[:num_agents]
+        return Ranked(scene, trajectories, controlled, self.distance(scene, trajectories, controlled))
 
     @staticmethod
     def _num_agents(scene: Scene, rows: int) -> int:
@@ -150,3 +173,8 @@ class RankRollouts(Transform):
                 "that the environment was made with."
             )
         return num_agents
+
+
+def _stacked(values: Sequence[Tensor], rows: int) -> Tensor:
+    """One tensor of values ``[..., A]`` of several scenes, padded to the agents of the environment."""
+    return torch.stack([pad(value, (0, rows - value.shape[-1])) for value in values])

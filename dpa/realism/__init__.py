@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dpa.realism.config import Histogram, Indicator, Kernel, RealismConfig
 from dpa.realism.features import Features, measure
-from dpa.realism.metric import RealismResult, mean_result, realism, realism_of, realism_of_groups
+from dpa.realism.metric import RealismResult, contributions, mean_result, realism, realism_of, realism_of_groups
 from dpa.realism.quirks import Quirk
 from dpa.realism.tracks import Generated, compare
 
@@ -18,6 +18,7 @@ __all__ = [
     "RealismConfig",
     "RealismResult",
     "compare",
+    "contributions",
     "mean_result",
     "measure",
     "realism",

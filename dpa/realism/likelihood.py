@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from dpa.realism.config import Differences, RealismConfig
+from dpa.realism.config import Differences, Histogram, Kernel, RealismConfig
 from dpa.realism.estimators import indicator_log_likelihood, log_likelihood
 from dpa.realism.features import Features
 from dpa.realism.quirks import Quirk
@@ -23,21 +25,41 @@ _RATES = {
 }
 
 
-def continuous_likelihoods(measured: Features, config: RealismConfig) -> dict[str, float]:
-    """Likelihood of each continuous feature, one mean over the scored steps of all agents."""
+class Score(NamedTuple):
+    """How likely the log of each of E agents is by one metric."""
+
+    total: Tensor
+    """``[E]``: log-likelihood, summed over what is scored [nats]."""
+    count: Tensor
+    """``[E]`` int64: steps that are scored, or 1 of an event."""
+
+
+def scores(measured: Features, config: RealismConfig) -> dict[str, Score]:
+    """Score every metric that was measured: continuous features, then events."""
     masks = _masks(measured, config)
-    result = {}
-    for name, estimator in config.continuous.items():
-        value, mask = measured.values[name], masks[name]
-        score = log_likelihood(
-            value[0],
-            value[1:],
-            estimator,
-            None if Quirk.UNMASKED_SAMPLES in config.quirks else mask,
-            keep_nan=Quirk.NAN_IN_LAST_BIN in config.quirks,
-        )
-        result[name] = (torch.where(mask, score, 0).sum() / mask.sum()).exp().item()
-    return result
+    found = {
+        name: _continuous(measured.values[name], masks[name], estimator, config)
+        for name, estimator in config.continuous.items()
+    }
+    for name, indicator in config.indicators.items():
+        if _EVENTS[name] in measured.values:
+            happened = _happened(measured, _EVENTS[name], config)
+            if name == "traffic_light_violation":
+                happened = happened & measured.vehicle
+            score = indicator_log_likelihood(happened[0], happened[1:], indicator)
+            found[name] = Score(score, torch.ones_like(score, dtype=torch.int64))
+    return found
+
+
+def _continuous(value: Tensor, mask: Tensor, estimator: Histogram | Kernel, config: RealismConfig) -> Score:
+    score = log_likelihood(
+        value[0],
+        value[1:],
+        estimator,
+        None if Quirk.UNMASKED_SAMPLES in config.quirks else mask,
+        keep_nan=Quirk.NAN_IN_LAST_BIN in config.quirks,
+    )
+    return Score(torch.where(mask, score, 0).sum(-1), mask.sum(-1))
 
 
 def _masks(measured: Features, config: RealismConfig) -> dict[str, Tensor]:
@@ -71,19 +93,6 @@ def _with_neighbours(valid: Tensor, differences: Differences) -> Tensor:
         result[:, 1:-1] = valid[:, :-2] & valid[:, 2:]
     else:
         result[:, 1:] = valid[:, :-1] & valid[:, 1:]
-    return result
-
-
-def indicator_likelihoods(measured: Features, config: RealismConfig) -> dict[str, float]:
-    """Likelihood of each event, one mean over all evaluated agents."""
-    result = {}
-    for name, indicator in config.indicators.items():
-        if _EVENTS[name] not in measured.values:
-            continue
-        happened = _happened(measured, _EVENTS[name], config)
-        if name == "traffic_light_violation":
-            happened = happened & measured.vehicle
-        result[name] = indicator_log_likelihood(happened[0], happened[1:], indicator).mean().exp().item()
     return result
 
 

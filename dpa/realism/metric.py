@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dpa.realism.config import BUCKETS, RealismConfig
 from dpa.realism.features import Features, measure
-from dpa.realism.likelihood import continuous_likelihoods, event_rates, indicator_likelihoods
+from dpa.realism.likelihood import event_rates, scores
 from dpa.realism.tracks import HORIZON, Comparison, Generated, compare
 from envs.scene import LOG_STEPS, Scene
 
@@ -215,6 +215,52 @@ def realism_of_groups(
     return [_score(measured.of(group), config, features=False) for group in groups]
 
 
+@torch.no_grad()
+def contributions(
+    scene: Scene, simulated: Tensor, config: str | Path | RealismConfig = "2024", *, quirks: bool = True
+) -> Tensor:
+    """What each evaluated agent of each rollout adds to the realism of the group, all rollouts against all but one.
+
+    An entry is the realism of the R rollouts minus what it is when the distributions of this agent are estimated from
+    the other R - 1 of them; a rollout adds the more, the more it looks like the log where others do not. With one
+    evaluated agent this is the difference of two calls of :func:`realism`; with many, the entries of a rollout add up
+    to that difference to first order. (A distribution that agents share is estimated without the whole rollout.)
+
+    Args:
+        scene: one uncollated scene.
+        simulated: ``[R, A, 80, 4]``, see :func:`realism`; R of 2 or more.
+        config: see :func:`realism`.
+        quirks: see :func:`realism`.
+
+    Returns:
+        ``[R, A]``, 0 of agents that are not evaluated.
+
+    Raises:
+        ValueError: as for :func:`realism`, or one rollout alone.
+
+    Examples:
+        >>> from envs.sources.synthetic import straight_road
+        >>> scene = straight_road(num_vehicles=2)
+        >>> log = torch.cat((scene.agents.position, scene.agents.heading[..., None]), -1)[None, :, 11:]
+        >>> contributions(scene, torch.cat((log, log, log + 50.0))).sum(1).sign()
+        tensor([ 1.,  1., -1.])
+    """
+    config, rollouts = _opened(config, quirks), len(simulated)
+    _check(scene, simulated, config, None)
+    if rollouts < 2:
+        raise ValueError(f"scene {scene.scene_id}: one rollout is a group of its own; give two or more.")
+    (measured,) = measure([compare(scene, simulated.to(scene.agents.position.dtype), config)], config)
+    others = [torch.tensor([other for other in range(rollouts) if other != each]) for each in range(rollouts)]
+    without = [scores(measured.of(some), config) for some in others]
+    added = simulated.new_zeros(rollouts, len(measured.track_id))
+    for name, (total, count) in scores(measured, config).items():
+        left = torch.stack([each[name].total for each in without])
+        whole, steps = total.sum(), count.sum().clamp(min=1)
+        added += config.weights[name] * ((whole / steps).exp() - ((whole - total + left) / steps).exp())
+    rows = (scene.agents.track_id[scene.agents.present] == measured.track_id[:, None]).nonzero()[:, 1]
+    return simulated.new_zeros(simulated.shape[:2]).index_copy_(1, rows, added)
+
+
 def _opened(config: str | Path | RealismConfig, quirks: bool) -> RealismConfig:
     opened = config if isinstance(config, RealismConfig) else RealismConfig.load(config)
     return opened if quirks else opened.replace(quirks=frozenset())
@@ -237,7 +283,8 @@ def _batches(comparisons: list[Comparison], budget: float) -> Iterator[list[Comp
 
 
 def _score(measured: Features, config: RealismConfig, features: bool) -> RealismResult:
-    likelihood = {**continuous_likelihoods(measured, config), **indicator_likelihoods(measured, config)}
+    scored = scores(measured, config)
+    likelihood = {name: (total.sum() / count.sum()).exp().item() for name, (total, count) in scored.items()}
     weights, displacement = config.weights, measured.displacement
     displacement = displacement[:, ~displacement.isnan().any(0)]  # without history, an agent may have no step at all
     return RealismResult(

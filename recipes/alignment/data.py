@@ -193,7 +193,7 @@ def _check_groups(data: DictConfig) -> None:
     for name, weight in data.rewards.items():
         if not is_number(weight):
             raise ValueError(f"method.data.rewards.{name} must be a number, got {weight!r}.")
-    check_rewards(data.rewards)
+    check_rewards(data.rewards, build_distance(data.ranking, "method.data.ranking"))
 
 
 def _check_pairs(data: DictConfig, pairs: int) -> None:

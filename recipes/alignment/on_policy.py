@@ -17,9 +17,7 @@ from torch.nn import functional as F
 
 from dpa.policy import ContextOptions, MotionLM, SceneContext
 from dpa.policy.actor import Contexts
-from dpa.ranking import Distance
-from dpa.ranking.transform import RankRollouts
-from dpa.rewards import advantages, reward_of
+from dpa.rewards import RewardRollouts, advantages
 from dpa.rollout import RolloutCollector, RolloutJob, RolloutTask, Workers, plan_tasks
 from dpa.rollout.collector import agents_of, rows_within
 from dpa.training.batches import Item, ShuffledOrder, collate_items, micro_batches, with_tokens
@@ -31,10 +29,10 @@ from envs.seeding import make_generator
 from recipes.alignment.candidates import Chosen, Group, group_of, pair_up
 from recipes.alignment.data import check_data, check_rolling
 from recipes.alignment.draws import Draw, make_batch
-from recipes.common.cli import build, plain
+from recipes.common.cli import build
 
 OF_AGENTS = {keys.TOKENS: -2, keys.SAMPLE_LOG_PROB: -2, keys.TOKEN_VALID: -2, keys.AGENT_DISTANCE: -1,
-             keys.AGENT_RANKED: -1, keys.AGENT_KIND: -1}  # fmt: skip
+             keys.AGENT_RANKED: -1, keys.AGENT_KIND: -1, keys.SPREAD: -1}  # fmt: skip
 """Entries of a ranked group with one row for each agent, and the dimension of these rows."""
 
 
@@ -97,7 +95,7 @@ class OnPolicyStep:
     ) -> None:
         self.data, self.options, self.seed = check_data(data, 0), options, seed
         self.loss, self.contexts, self.device, self.ranks = loss, Contexts(scenes, context), device, ranks
-        self.passes = data.get("passes", 1)
+        self.passes, self.rewards = data.get("passes", 1), _weighing(data)
         self.optimizer = make_optimizer(model, options.lr, options.weight_decay)
         self.schedule = make_schedule(self.optimizer, self.passes * options.steps, self.passes * options.warmup)
         order = ShuffledOrder(len(scenes), options.scenes_per_step, seed)
@@ -118,7 +116,9 @@ class OnPolicyStep:
             decoding=decoding,
             options=context,
             seed=seed,
-            make_postproc=partial(RankSampled, num_rollouts=data.num_rollouts, distance=distance),
+            make_postproc=partial(
+                RewardRollouts, num_rollouts=data.num_rollouts, distance=distance, rewards=self.rewards
+            ),
             device=device,
         )
         self.collector = RolloutCollector(job, [task for each in tasks for task in each], workers)
@@ -132,8 +132,9 @@ class OnPolicyStep:
 
         Returns:
             What the loss logs in the last pass, ``gradient_norm`` before clipping, what the rollouts are like
-            (``rollout_distance``, ``rollout_ade`` [m]) and how long they and what is learnt from them take
-            (``seconds_rollout``, ``seconds_learning``).
+            (``rollout_distance``, ``rollout_ade`` and ``rollout_spread`` [m], ``rollout_pair_accuracy``: how often the
+            nearer of a pair of them, nearest against farthest, is the likelier one, and each reward by its name) and
+            how long they and what is learnt from them take (``seconds_rollout``, ``seconds_learning``).
         """
         start = time.perf_counter()
         rolled = self._roll_out(step)
@@ -162,16 +163,32 @@ class OnPolicyStep:
     def _of_scene(self, ranked: TensorDictBase) -> Rolled:
         scene, ranked = int(ranked[keys.SCENE]), ranked.cpu()
         context = self.contexts[scene]
-        for key, agents in OF_AGENTS.items():
+        rewards = {(keys.REWARDS, name): -2 for name in self.rewards}
+        for key, agents in (OF_AGENTS | rewards).items():
             ranked[key] = ranked[key].narrow(agents, 0, len(context.kind))
         return Rolled(scene, context, ranked)
 
     def _told(self, rolled: list[Rolled]) -> dict[str, float]:
-        """Means over the rollouts of all ranks."""
-        named = {"rollout_distance": keys.DISTANCE, "rollout_ade": keys.ADE}
-        sums = [sum(float(one.ranked[key].mean()) for one in rolled) for key in named.values()]
-        *totals, count = self.ranks.sum(torch.tensor([*sums, len(rolled)], dtype=torch.float64)).tolist()
-        return {name: total / count for name, total in zip(named, totals, strict=True)}
+        """Means over the scenes of all ranks."""
+        told = [self._told_of(one) for one in rolled]
+        sums = torch.tensor([*(sum(each[name] for each in told) for name in told[0]), len(told)], dtype=torch.float64)
+        *totals, count = self.ranks.sum(sums).tolist()
+        return {f"rollout_{name}": total / count for name, total in zip(told[0], totals, strict=True)}
+
+    def _told_of(self, one: Rolled) -> dict[str, float]:
+        """What a scene's rollouts are like; rewards are those of whole episodes, means over agents that were moved."""
+        ranked, moved = one.ranked, one.token_valid.any(-1)
+        likely = (ranked[keys.SAMPLE_LOG_PROB] * one.token_valid).sum((-1, -2))
+        order, pairs = ranked[keys.RANK].argsort(), max(1, len(likely) // 4)
+        nearer, farther = likely[order[:pairs]], likely[order[-pairs:].flip(0)]
+        paid = {name: float(ranked[keys.REWARDS, name][:, moved, 0].mean()) for name in self.rewards if moved.any()}
+        return {
+            "distance": float(ranked[keys.DISTANCE].mean()),
+            "ade": float(ranked[keys.ADE].mean()),
+            "spread": float(ranked[keys.SPREAD][moved].mean()) if moved.any() else 0.0,
+            "pair_accuracy": float((nearer > farther).float().mean()),
+            **(paid or dict.fromkeys(self.rewards, 0.0)),
+        }
 
     def _groups(self, rolled: list[Rolled]) -> Iterator[tuple[TensorDict, float]]:
         """Rollouts with their advantages, each part with its share of the tokens of all ranks."""
@@ -184,9 +201,9 @@ class OnPolicyStep:
             yield group_batch([(rolled[row], graded[row]) for row in rows], some).to(self.device), share
 
     def _graded(self, one: Rolled) -> Tensor:
-        """``[K, A or 1]``: advantages of a scene's rollouts."""
-        reward = reward_of(one.ranked[None], plain(self.data.rewards))
-        return advantages(reward, baseline=self.data.baseline, scale=self.data.scale)[0]
+        """``[K, A, T]``: advantages of a scene's rollouts."""
+        reward = sum(weight * one.ranked[keys.REWARDS, name] for name, weight in self.rewards.items())
+        return advantages(reward[None], baseline=self.data.baseline, scale=self.data.scale)[0]
 
     def _pairs(self, rolled: list[Rolled], step: int) -> Iterator[tuple[TensorDict, float]]:
         """Pairs of rollouts, each part with its share of those of all ranks."""
@@ -205,26 +222,9 @@ class OnPolicyStep:
         return group_of(self.data, one.context, one.ranked, Chosen(near[0], far[0]))
 
 
-class RankSampled(RankRollouts):
-    """Ranked groups with the log-probabilities by which their tokens were drawn, ``[S, K, A, T]`` [nats].
-
-    Args:
-        scenes: where the environment's scenes come from.
-        num_rollouts: K.
-        distance: how rollouts are compared.
-    """
-
-    def __init__(self, scenes: SceneSource, num_rollouts: int, distance: Distance) -> None:
-        super().__init__(scenes, num_rollouts, distance)
-        self.in_keys = [*self.in_keys, keys.SAMPLING_LOG_PROB]
-        self.out_keys = [*self.out_keys, keys.SAMPLE_LOG_PROB]
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Rank every group: ``[S * K, T]`` -> ``[S]``."""
-        groups = super().forward(tensordict)
-        likely = tensordict[keys.SAMPLING_LOG_PROB].unflatten(0, (-1, self.num_rollouts))
-        groups[keys.SAMPLE_LOG_PROB] = likely.movedim(2, -1)
-        return groups
+def _weighing(data: DictConfig) -> dict[str, float]:
+    """Weights of the rewards that a method follows, if it follows any."""
+    return {name: weight for name, weight in data.get("rewards", {}).items() if weight}
 
 
 def tasks_of(step: int, sizes: dict[int, int], num_rollouts: int, most: int, workers: int = 1) -> list[RolloutTask]:
@@ -276,7 +276,7 @@ def group_batch(graded: Sequence[tuple[Rolled, Tensor]], some: range) -> TensorD
     """A batch for :class:`~dpa.losses.PolicyGradientLoss`.
 
     Args:
-        graded: scenes with the advantages ``[K, A or 1]`` of all their rollouts.
+        graded: scenes with the advantages ``[K, A, T]`` of all their rollouts.
         some: the rollouts that are in the batch.
     """
     part = slice(some.start, some.stop)
@@ -288,5 +288,5 @@ def group_batch(graded: Sequence[tuple[Rolled, Tensor]], some: range) -> TensorD
         return F.pad(value, (0, 0, 0, agents - value.shape[1]))
 
     likely = [padded(one.ranked[keys.SAMPLE_LOG_PROB][part]) for one, _ in graded]
-    each = [padded(value[part, :, None].expand(-1, len(one.token_valid), -1)) for one, value in graded]
+    each = [padded(value[part]) for _, value in graded]
     return batch.update({keys.SAMPLE_LOG_PROB: torch.stack(likely), keys.ADVANTAGE: torch.stack(each)})

@@ -1,0 +1,82 @@
+"""Rewards behind a collector, beside the ranking."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+from torch.nn.functional import pad
+
+from dpa.ranking import Distance
+from dpa.ranking.transform import PAPER_DISTANCE, Ranked, RankRollouts
+from dpa.rewards.functions import REWARDS, Outcome, check_rewards
+from envs import keys
+from envs.scene import SceneSource
+
+
+class RewardRollouts(RankRollouts):
+    """Ranks rollouts, pays for them, and keeps the log-probabilities by which their tokens were drawn.
+
+    Writes, beside what :class:`~dpa.ranking.transform.RankRollouts` writes, ``SAMPLE_LOG_PROB``, ``SPREAD`` and, under
+    ``REWARDS``, each reward by its name, ``[S, K, A, T]``, 0 of padding. Reads ``SAMPLING_LOG_PROB`` as well.
+
+    Args:
+        scenes: where the environment's scenes come from.
+        num_rollouts: K.
+        distance: how rollouts are compared.
+        rewards: weights by name, of :data:`~dpa.rewards.functions.REWARDS`; those of 0 are left out. None at all pay
+            nothing.
+
+    Raises:
+        ValueError: as :func:`~dpa.rewards.functions.check_rewards`, and as the ranking.
+    """
+
+    def __init__(
+        self,
+        scenes: SceneSource,
+        num_rollouts: int,
+        distance: Distance = PAPER_DISTANCE,
+        rewards: Mapping[str, float] | None = None,
+    ) -> None:
+        super().__init__(scenes, num_rollouts, distance)
+        if rewards:
+            check_rewards(rewards, distance)
+        self.rewards = [name for name, weight in (rewards or {}).items() if weight]
+        self.in_keys = [*self.in_keys, keys.SAMPLING_LOG_PROB]
+        self.out_keys = [
+            *self.out_keys,
+            keys.SAMPLE_LOG_PROB,
+            keys.SPREAD,
+            *((keys.REWARDS, name) for name in self.rewards),
+        ]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Rank and pay every group: ``[S * K, T]`` -> ``[S]``."""
+        groups = super().forward(tensordict)
+        likely = tensordict[keys.SAMPLING_LOG_PROB].unflatten(0, (-1, self.num_rollouts))
+        return groups.set(keys.SAMPLE_LOG_PROB, likely.movedim(2, -1))
+
+    def entries(self, ranked: Sequence[Ranked], rows: int, decisions: int) -> dict[NestedKey, Tensor]:
+        """The ranking, and the rewards."""
+        outcomes = [Outcome(*group, distance=self.distance, decisions=decisions) for group in ranked]
+        paid = {
+            (keys.REWARDS, name): torch.stack([self._paid(name, one, rows) for one in outcomes])
+            for name in self.rewards
+        }
+        spread = torch.stack([pad(_spread(one.trajectories), (0, rows - len(one.controlled))) for one in outcomes])
+        return super().entries(ranked, rows, decisions) | {keys.SPREAD: spread, **paid}
+
+    def _paid(self, name: str, outcome: Outcome, rows: int) -> Tensor:
+        """``[K, rows, T]``."""
+        rollouts, agents = outcome.trajectories.shape[:2]
+        paid = outcome.trajectories.new_zeros(rollouts, rows, outcome.decisions)
+        paid[:, :agents] = REWARDS[name](outcome)
+        return paid
+
+
+def _spread(trajectories: Tensor) -> Tensor:
+    """``[A]`` [m], of ``[K, A, T * F, 4]``."""
+    last = trajectories[:, :, -1, :2]
+    return (last - last.mean(0)).square().sum(-1).mean(0).sqrt()
