@@ -1,0 +1,147 @@
+"""Rewards of ranked rollouts, by hand and against what they are made of."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dpa.ranking import DisplacementDistance, PreferenceDistance, log_trajectory
+from dpa.realism import realism
+from dpa.rewards import REWARDS, Outcome, check_rewards
+from envs.scene import Scene
+from envs.sources.synthetic import red_light, straight_road
+
+
+def outcome_of(
+    scene: Scene, trajectories: Tensor, controlled: Tensor | None = None, stride: int = 5, decisions: int = 16
+) -> Outcome:
+    distance = PreferenceDistance(stride=stride)
+    controlled = torch.ones(trajectories.shape[1], dtype=torch.bool) if controlled is None else controlled
+    ranking = distance(scene, trajectories, controlled)
+    return Outcome(scene, trajectories, controlled, ranking, distance, decisions)
+
+
+def lagging(scene: Scene, *metres: float, agent: int = 0) -> Tensor:
+    """The log, with one agent that falls behind evenly, a rollout for each distance in the end [m]."""
+    log = log_trajectory(scene, 80)
+    lag = torch.tensor(metres)[:, None, None] * torch.linspace(0, 1, 80)[:, None] * torch.tensor([1.0, 0, 0, 0])
+    rollouts = log.repeat(len(metres), 1, 1, 1)
+    rollouts[:, agent] -= lag
+    return rollouts
+
+
+@pytest.fixture
+def road() -> Outcome:
+    """Three rollouts of two vehicles, the first of which keeps to its log, is 4 m and is 9 m behind in the end."""
+    scene = straight_road(2)
+    return outcome_of(scene, lagging(scene, 0.0, 4.0, 9.0))
+
+
+def test_the_distance_is_paid_by_scene_and_by_agent(road: Outcome) -> None:
+    ranking = road.ranking
+    assert torch.equal(REWARDS["distance"](road), -ranking.distance[:, None, None])
+    assert torch.equal(REWARDS["agent_distance"](road), -ranking.agent_distance[..., None])
+    assert torch.equal(REWARDS["ade"](road), -ranking.ade[:, None, None])
+    assert ranking.ade.tolist() == pytest.approx([0, 1, 2.25])
+    paid = REWARDS["agent_distance"](road)[..., 0]
+    assert (paid[1:, 0] < paid[1:, 1]).all(), "who falls behind pays most"
+
+
+@pytest.mark.parametrize("stride", [1, 2, 5, 8, 20])
+@pytest.mark.parametrize("decisions", [16, 8])
+def test_what_follows_the_first_decision_is_the_whole_distance_and_it_only_falls(stride: int, decisions: int) -> None:
+    scene = straight_road(2)
+    road = outcome_of(scene, lagging(scene, 0.0, 4.0, 9.0), stride=stride, decisions=decisions)
+    to_go = -REWARDS["step_distance"](road)
+    assert to_go.shape == (3, 2, decisions)
+    torch.testing.assert_close(to_go[..., 0], road.ranking.agent_distance)
+    assert (to_go.diff(dim=-1) <= 1e-6).all() and (to_go[..., -1] >= 0).all()
+
+
+def test_a_decision_answers_for_what_comes_after_it_alone() -> None:
+    scene = straight_road(1)
+    late = log_trajectory(scene, 80)[None].clone()
+    late[:, :, 75:, 1] += 3.0  # beside its lane in the last decision
+    to_go = -REWARDS["step_distance"](outcome_of(scene, late))[0, 0]
+    # every step pays 3 m of lateral offset in one of sixteen moments, and what that adds to its speed
+    torch.testing.assert_close(to_go, to_go[:1].expand(16))
+    early = log_trajectory(scene, 80)[None].clone()
+    early[:, :, :5, 1] += 3.0
+    to_go = -REWARDS["step_distance"](outcome_of(scene, early))[0, 0]
+    assert to_go[0] > 0 and to_go[3:].max() < 0.1 * to_go[0]
+
+
+def test_realism_pays_who_looks_like_the_log(road: Outcome) -> None:
+    paid = REWARDS["realism"](road)
+    assert paid.shape == (3, 2, 1)
+    assert paid[0, 0] > paid[1, 0] > paid[2, 0]
+
+
+@pytest.mark.parametrize("metres", [(0.0, 3.0), (1.0, 5.0, 12.0)])
+def test_of_one_agent_realism_pays_the_difference_that_a_rollout_makes(metres: tuple[float, ...]) -> None:
+    scene = straight_road(1)
+    rollouts = lagging(scene, *metres)
+    paid = REWARDS["realism"](outcome_of(scene, rollouts))[:, 0, 0]
+    whole = realism(scene, rollouts).realism
+    others = [torch.cat((rollouts[:k], rollouts[k + 1 :])) for k in range(len(rollouts))]
+    assert paid.tolist() == pytest.approx([whole - realism(scene, each).realism for each in others], abs=1e-6)
+
+
+def test_realism_pays_all_controlled_agents_and_no_other() -> None:
+    scene = straight_road(3)
+    scene.agents.predict[:], scene.agents.sdc[:] = False, torch.tensor([True, False, False])
+    rollouts = torch.cat((lagging(scene, 0.0, 2.0, 5.0, agent=1), lagging(scene, 1.0, agent=2)))
+    controlled = torch.tensor([False, True, True])
+    paid = REWARDS["realism"](outcome_of(scene, rollouts, controlled))
+    assert not paid[:, 0].any() and (paid[:, 1:].std(0) > 0).all()
+    assert not scene.agents.predict.any(), "the scene itself is as it was"
+
+
+def test_an_event_costs_whom_it_happens_to_and_its_mean_is_the_rate_of_the_metric() -> None:
+    scene = straight_road(2, seed=1)
+    scene.agents.predict[:] = True
+    rollouts = log_trajectory(scene, 80)[None].repeat(3, 1, 1, 1)
+    rollouts[1, 0, 40:] = rollouts[1, 1, 40:]  # into the other one
+    rollouts[2, 0, 60:, 1] += 40.0  # off the road
+    road, result = outcome_of(scene, rollouts), realism(scene, rollouts)
+    collision, offroad = REWARDS["collision"](road)[..., 0], REWARDS["offroad"](road)[..., 0]
+    assert collision.tolist() == [[0, 0], [-1, -1], [0, 0]]
+    assert offroad[2].tolist() == [-1, 0] and offroad[:2].sum() == 0
+    assert -collision.mean() == pytest.approx(result.collision_rate)
+    assert -offroad.mean() == pytest.approx(result.offroad_rate)
+
+
+def test_a_measure_of_safety_costs_who_does_what_it_is_about() -> None:
+    scene = red_light(speed=8.0)
+    through = log_trajectory(scene, 80)[None].repeat(2, 1, 1, 1)
+    through[1] = through[1, :, :1]  # stands
+    assert REWARDS["red_light"](outcome_of(scene, through))[:, 0, 0].tolist() == [-1, 0]
+    nowhere = straight_road(1)
+    assert not REWARDS["red_light"](outcome_of(nowhere, lagging(nowhere, 0.0, 1.0))).any(), "there is no light"
+
+
+@given(st.lists(st.floats(0, 30), min_size=2, max_size=4))
+def test_every_reward_is_finite_and_fits_the_group(metres: list[float]) -> None:
+    scene = straight_road(2)
+    road = outcome_of(scene, lagging(scene, *metres))
+    for name, reward in REWARDS.items():
+        paid = reward(road)
+        assert paid.isfinite().all(), name
+        assert paid.expand(len(metres), 2, 16).shape == (len(metres), 2, 16), name
+
+
+def test_unknown_rewards_none_at_all_and_those_that_a_distance_cannot_tell_are_refused() -> None:
+    distance = PreferenceDistance()
+    with pytest.raises(ValueError, match="no reward .speed.; choose among distance, agent_distance, step_distance,"):
+        check_rewards({"speed": 1.0}, distance)
+    with pytest.raises(ValueError, match="all of the rewards ade weigh 0"):
+        check_rewards({"ade": 0.0}, distance)
+    with pytest.raises(ValueError, match="step_distance needs a distance that couples moments"):
+        check_rewards({"step_distance": 1.0}, DisplacementDistance())
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])
