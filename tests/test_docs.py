@@ -393,7 +393,7 @@ def test_the_study_beside_the_results_has_the_options_that_its_command_gives(stu
         for newer in ("start", "keep_gib", "rms", "recovery", "precision", "schedule"):
             given["pretraining"].pop(newer)
         assert given["pretraining"].pop("optimizer") == "adamw", "there was no other"
-        for newer in ("memory", "workers"):  # of methods that roll out by themselves
+        for newer in ("memory", "workers", "staleness"):  # of methods that roll out by themselves
             given["alignment"].pop(newer)
         for name in ("seeds", "model", "pretraining", "collection", "alignment", "evaluation", "decoding", "rankings"):
             assert made[name] == given[name], name

@@ -33,12 +33,18 @@ class RolloutCollector(BaseCollector):
     """Whole episodes of all scenes, task by task, in the order of the tasks whoever does them.
 
     A worker that is killed costs the task that it was at: another one does it again. Weights and seed take effect with
-    the next batch that is handed out, also where workers are ahead of it, so every crew gives the same batches.
+    the next batch that is handed out, also where workers are ahead of it, so every crew gives the same batches. With a
+    bound on staleness above 0 batches of workers that are ahead are kept, and tell by :attr:`staleness` how old they
+    are; which they are depends on the clock.
 
     Args:
         job: what is rolled out.
-        tasks: see :func:`~dpa.rollout.plan.plan_tasks`.
+        tasks: see :func:`~dpa.rollout.plan.plan_tasks`; :meth:`add` gives more.
         workers: who does it.
+        max_staleness: updates of weights or seed since a batch was begun that it may have missed.
+
+    Attributes:
+        staleness: updates that the batch that was handed out last has missed.
 
     Raises:
         ChildProcessError: while iterating, when a task cost :data:`MOST_LOSSES` workers.
@@ -46,27 +52,57 @@ class RolloutCollector(BaseCollector):
     Iterating starts the workers; they end with the last batch, with :meth:`shutdown`, or when the loop is left.
     """
 
-    def __init__(self, job: RolloutJob, tasks: Sequence[RolloutTask], workers: Workers | None = None) -> None:
+    def __init__(
+        self,
+        job: RolloutJob,
+        tasks: Sequence[RolloutTask] = (),
+        workers: Workers | None = None,
+        max_staleness: int = 0,
+    ) -> None:
         super().__init__()
-        self.job, self.tasks, self.workers = job, list(tasks), workers or Workers()
-        self._next, self._hold = 0, len(self.tasks)
+        if max_staleness < 0:
+            raise ValueError(f"max_staleness must be 0 or more, got {max_staleness}.")
+        self.job, self.workers, self.max_staleness = job, workers or Workers(), max_staleness
+        self._tasks, self._known, self._next, self.staleness = dict(enumerate(tasks)), len(tasks), 0, 0
         self._weights: Mapping[str, Tensor] | None = None
         self._crew: Crew | None = None
 
     def __len__(self) -> int:
-        return len(self.tasks)
+        return self._known
+
+    def add(self, tasks: Sequence[RolloutTask]) -> None:
+        """More tasks, after those that are known; workers that have none begin at once.
+
+        Examples:
+            >>> from dpa.tokens import VerletTokenizer
+            >>> from envs.sources.synthetic import straight_road
+            >>> job = RolloutJob([straight_road(2)], MotionLM("nano", VerletTokenizer()), num_rollouts=2)
+            >>> collector = RolloutCollector(job)
+            >>> batches = iter(collector)
+            >>> for first in (0, 2):
+            ...     collector.add([RolloutTask((0,), (range(first, first + 2),))])
+            ...     next(batches).batch_size
+            torch.Size([2, 16])
+            torch.Size([2, 16])
+        """
+        numbers = range(self._known, self._known + len(tasks))
+        self._tasks |= dict(zip(numbers, tasks, strict=True))
+        self._known += len(tasks)
+        if self._crew is not None:
+            self._waiting += numbers  # larger than all others, so it stays a heap
+            self._feed()
 
     def iterator(self) -> Iterator[TensorDictBase]:
         """Batches of the tasks that are left: what the post-processing makes of ``[S * K, T]``."""
         try:
             self._begin()
-            while self._next < len(self.tasks):
-                if self._next >= self._hold:
-                    raise ValueError(f"the collector is held at task {self._hold}; say hold_at with a later one first.")
+            while self._next < self._known:
                 while self._next not in self._made:
                     self._feed()
                     self._take(*self._crew.wait())
-                batch = self._made.pop(self._next)
+                batch, version = self._made.pop(self._next)
+                self.staleness = self._version - version
+                del self._tasks[self._next]
                 self._next += 1
                 yield batch
         finally:
@@ -78,20 +114,20 @@ class RolloutCollector(BaseCollector):
         self._crew = hire(self.job, self.workers)
         if self._weights is not None:
             self._crew.update(self._weights, self.job.seed)
-        self._waiting = list(range(self._next, len(self.tasks)))
+        self._waiting = list(range(self._next, self._known))
         self._idle = list(range(self._crew.size))
         self._running: dict[int, tuple[int, int]] = {}
-        self._made: dict[int, TensorDictBase] = {}
+        self._made: dict[int, tuple[TensorDictBase, int]] = {}
         self._lost: Counter[int] = Counter()
         self._version = 0
 
     def _feed(self) -> None:
         """Give the first tasks that wait to those who have none, not too far ahead of the next batch."""
-        last = min(self._next + AHEAD * self._crew.size, self._hold)
+        last = self._next + AHEAD * self._crew.size
         while self._idle and self._waiting and self._waiting[0] < last:
             worker, number = self._idle.pop(), heappop(self._waiting)
             self._running[worker] = number, self._version
-            self._crew.submit(worker, self.tasks[number])
+            self._crew.submit(worker, self._tasks[number])
 
     def _take(self, worker: int, outcome: Outcome) -> None:
         number, version = self._running.pop(worker)
@@ -100,28 +136,32 @@ class RolloutCollector(BaseCollector):
             raise outcome.error
         if outcome.batch is None:
             self._lose(number)
-        elif version == self._version:
-            self._made[number] = outcome.batch
+        elif self._is_fresh(version):
+            self._made[number] = outcome.batch, version
             return
         heappush(self._waiting, number)
 
     def _lose(self, number: int) -> None:
         self._lost[number] += 1
         if self._lost[number] == MOST_LOSSES:
+            scenes = list(self._tasks[number].scenes)[:5]
             raise ChildProcessError(
-                f"{MOST_LOSSES} workers were killed over the scenes {list(self.tasks[number].scenes)[:5]}, perhaps for "
-                "want of memory; give fewer workers or a smaller budget."
+                f"{MOST_LOSSES} workers were killed over the scenes {scenes}, perhaps for want of memory; give fewer "
+                "workers or a smaller budget."
             )
 
     def _changed(self) -> None:
-        """What was made ahead of the next batch was made with what held before: it is done again."""
+        """What was made ahead was made with what held before: where that is too old, it is done again."""
         if self._crew is None:
             return
         self._version += 1
-        self._waiting += self._made
+        self._waiting += [number for number, (_, version) in self._made.items() if not self._is_fresh(version)]
+        self._made = {number: made for number, made in self._made.items() if self._is_fresh(made[1])}
         heapify(self._waiting)
-        self._made.clear()
         self._crew.update(self._weights, self.job.seed)
+
+    def _is_fresh(self, version: int) -> bool:
+        return self._version - version <= self.max_staleness
 
     # --- TorchRL's collectors ---------------------------------------------------------------------------------------
     def update_policy_weights_(
@@ -146,14 +186,6 @@ class RolloutCollector(BaseCollector):
         self._weights = {name: value.detach().clone() for name, value in (known | dict(given)).items()}
         self._changed()
 
-    def hold_at(self, task: int) -> None:
-        """Hand out no task from this one on, until told otherwise: workers would do it with weights of the past.
-
-        Args:
-            task: its number.
-        """
-        self._hold = task
-
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seed the rollouts from the next batch on; returns the seed."""
         self.job = replace(self.job, seed=seed)
@@ -165,9 +197,10 @@ class RolloutCollector(BaseCollector):
         return OrderedDict(next=self._next, seed=self.job.seed)
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Go to where another collector of the same tasks was; iterate anew."""
+        """Go forward to where another collector of the same tasks was; iterate anew."""
         self.shutdown()
         self._next = int(state_dict["next"])
+        self._tasks = {number: task for number, task in self._tasks.items() if number >= self._next}
         self.job = replace(self.job, seed=int(state_dict["seed"]))
 
     def shutdown(self, *_: Any, **__: Any) -> None:

@@ -76,6 +76,11 @@ def check_fit(method: DictConfig, alignment: DictConfig, held: int) -> None:
             f"method.data.passes={data.passes} takes several steps with the same rollouts, which without a clip lead "
             "away from the policy that drew them; say method.loss.clip=0.2, or method.data.passes=1."
         )
+    if data.kind == "own_groups" and alignment.staleness > 0 and method.loss.get("clip") is None:
+        raise ValueError(
+            f"alignment.staleness={alignment.staleness} learns from rollouts of older weights, whose gradient needs a "
+            "ratio of likelihoods; say method.loss.clip=0.2, or alignment.staleness=0."
+        )
     wanted = getattr(LOSSES.get(method.loss.kind), "sides", None)
     given = SIDES.get(method.data.kind)
     if wanted is None or given is None or given in FITS[wanted]:

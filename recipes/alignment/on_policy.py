@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import accumulate
 from typing import NamedTuple
 
 import torch
@@ -62,6 +61,9 @@ class OnPolicyStep:
     post-processing. What a step draws depends on its number, the seed and the weights alone, so that a run that goes
     on does what it would have done, on any number of ranks. A scene that a step has twice counts twice.
 
+    With ``staleness`` workers roll the next steps out while this one learns, by weights that are so many steps old at
+    most. How old they are depends on the clock, and so does what is learnt.
+
     Args:
         model: to align.
         loss: of a batch; a loss module, or what the ranks wrapped it into.
@@ -98,16 +100,14 @@ class OnPolicyStep:
         self.passes, self.rewards = data.get("passes", 1), _weighing(data)
         self.optimizer = make_optimizer(model, options.lr, options.weight_decay)
         self.schedule = make_schedule(self.optimizer, self.passes * options.steps, self.passes * options.warmup)
-        order = ShuffledOrder(len(scenes), options.scenes_per_step, seed)
-        self.scenes = [ranks.mine(order(step)) for step in range(options.steps)]
-        workers = build(Workers, options.workers, "alignment.workers")
-        most = rows_within(options.memory, model, context)
-        agents = agents_of(scenes, None, context)
-        tasks = [
-            tasks_of(step, {scene: agents[scene] for scene in some}, data.num_rollouts, most, workers.count)
-            for step, some in enumerate(self.scenes)
-        ]
-        self._ends = list(accumulate((len(each) for each in tasks), initial=0))
+        self.order = ShuffledOrder(len(scenes), options.scenes_per_step, seed)
+        self.workers = build(Workers, options.workers, "alignment.workers")
+        if options.staleness > 0 and self.workers.backend == "local":
+            raise ValueError(
+                f"alignment.staleness={options.staleness} needs workers that roll out while a step learns; say "
+                "alignment.workers.backend=process, or staleness=0."
+            )
+        self.most, self.agents = rows_within(options.memory, model, context), agents_of(scenes, None, context)
         decoding, distance = check_rolling(data)
         job = RolloutJob(
             scenes,
@@ -121,8 +121,10 @@ class OnPolicyStep:
             ),
             device=device,
         )
-        self.collector = RolloutCollector(job, [task for each in tasks for task in each], workers)
+        self.collector = RolloutCollector(job, (), self.workers, max_staleness=options.staleness)
         self._batches: Iterator[TensorDictBase] | None = None
+        self._tasks: dict[int, int] = {}
+        """How many there are of each step whose rollouts are under way."""
 
     def __call__(self, step: int) -> dict[str, Tensor | float]:
         """Take one step.
@@ -133,8 +135,9 @@ class OnPolicyStep:
         Returns:
             What the loss logs in the last pass, ``gradient_norm`` before clipping, what the rollouts are like
             (``rollout_distance``, ``rollout_ade`` and ``rollout_spread`` [m], ``rollout_pair_accuracy``: how often the
-            nearer of a pair of them, nearest against farthest, is the likelier one, and each reward by its name) and
-            how long they and what is learnt from them take (``seconds_rollout``, ``seconds_learning``).
+            nearer of a pair of them, nearest against farthest, is the likelier one, and each reward by its name), the
+            mean ``staleness`` of their weights [steps], and how long they and what is learnt from them take
+            (``seconds_rollout``, ``seconds_learning``).
         """
         start = time.perf_counter()
         rolled = self._roll_out(step)
@@ -144,21 +147,36 @@ class OnPolicyStep:
             figures = accumulate_gradients(self.loss, parts, self.ranks)
             norm = clip_and_step(self.optimizer, self.options.max_norm, self.schedule)
         took = {"seconds_rollout": before - start, "seconds_learning": time.perf_counter() - before}
+        told["staleness"] = self.staleness
         return {**figures, "gradient_norm": norm, **told, **took}
 
     def _roll_out(self, step: int) -> list[Rolled]:
-        """The groups of this rank's scenes, by the weights of the moment."""
-        first, last = self._ends[step : step + 2]
-        self.collector.hold_at(last)  # what comes after waits for what this step learns
+        """The groups of this rank's scenes, by the weights of the moment or, within the bound, of some steps before."""
         if self._batches is None:
-            self.collector.load_state_dict({"next": first, "seed": self.seed})
             self._batches = iter(self.collector)
         self.collector.update_policy_weights_()
-        groups = [group for _ in range(first, last) for group in next(self._batches)]
-        if last == self._ends[-1]:
+        for ahead in range(step, min(step + self.options.staleness + 1, self.options.steps)):
+            self._begin(ahead)
+        groups, ages = [], []
+        for _ in range(self._tasks.pop(step)):
+            groups.extend(next(self._batches))
+            ages.append(self.collector.staleness)
+        if step == self.options.steps - 1:
             self.collector.shutdown()
+        self.staleness = sum(ages) / len(ages)
         rolled = {each.scene: each for each in map(self._of_scene, groups)}
-        return [rolled[scene] for scene in self.scenes[step]]
+        return [rolled[scene] for scene in self._scenes(step)]
+
+    def _scenes(self, step: int) -> list[int]:
+        return self.ranks.mine(self.order(step))
+
+    def _begin(self, step: int) -> None:
+        """Have the scenes of a step rolled out, unless they are."""
+        if step not in self._tasks:
+            sizes = {scene: self.agents[scene] for scene in self._scenes(step)}
+            tasks = tasks_of(step, sizes, self.data.num_rollouts, self.most, self.workers.count)
+            self._tasks[step] = len(tasks)
+            self.collector.add(tasks)
 
     def _of_scene(self, ranked: TensorDictBase) -> Rolled:
         scene, ranked = int(ranked[keys.SCENE]), ranked.cpu()

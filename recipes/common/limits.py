@@ -48,7 +48,7 @@ COUNTS = (
 BINS = ("bins.vehicle", "bins.pedestrian", "bins.cyclist")
 LIMITS: dict[str, Limit] = {
     **dict.fromkeys(COUNTS, COUNT),
-    **dict.fromkeys(("workers", "warmup", "part", "top_k", "min_agents", "pictures.scenes"), NUMBER),
+    **dict.fromkeys(("workers", "warmup", "staleness", "part", "top_k", "min_agents", "pictures.scenes"), NUMBER),
     **dict.fromkeys(
         ("aligned_scenes", "scenes.limit", "select.max_agents", "submission_shards"), COUNT._replace(empty=True)
     ),

@@ -31,7 +31,8 @@ def test_it_needs_no_preferences_and_tells_what_it_rolls_out(
 ) -> None:
     outcome = run("align", *aligning(options, origin, method, tmp_path))
     assert outcome.status == 0, outcome.err
-    for curve in ("rollout_distance", "rollout_ade", "seconds_rollout", "seconds_learning", "kl", "entropy"):
+    rolled = ("rollout_distance", "rollout_ade", "rollout_spread", "rollout_pair_accuracy", "seconds_rollout")
+    for curve in (*rolled, "seconds_learning", "staleness", "kl", "entropy"):
         values = [value for _, value in read_curve(tmp_path, f"train/{curve}")]
         assert len(values) == 4 and min(values) >= 0, curve
     assert read_curve(tmp_path, "train/kl")[0][1] == pytest.approx(0.0, abs=1e-6) or method == "grpo"
@@ -95,6 +96,18 @@ def test_processes_that_roll_out_change_rounding_alone(
     assert_same(tmp_path / "alone", tmp_path / "processes", atol=1e-5)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["grpo", "dpa_omf_on_policy"])
+def test_workers_that_roll_out_while_a_step_learns_keep_to_the_bound(
+    run: Callable, options: Callable, origin: Path, tmp_path: Path, method: str
+) -> None:
+    crew = ("alignment.workers.backend=process", "alignment.workers.count=2", "alignment.staleness=2")
+    outcome = run("align", *aligning(options, origin, method, tmp_path, "alignment.steps=8", *crew))
+    assert outcome.status == 0, outcome.err
+    ages = [value for _, value in read_curve(tmp_path, "train/staleness")]
+    assert ages[0] == 0 and 0 < max(ages) <= 2
+
+
 def test_no_two_steps_roll_out_by_the_same_draws_and_all_workers_have_a_part() -> None:
     sizes = {0: 3, 1: 4, 2: 5}
     tasks = {step: tasks_of(step, sizes, num_rollouts=4, most=1000, workers=2) for step in (0, 1)}
@@ -127,6 +140,16 @@ def test_no_two_steps_roll_out_by_the_same_draws_and_all_workers_have_a_part() -
         ("rloo", ["method.loss.kl=-1"], "method.loss.kl must be 0 or more, got -1"),
         ("rloo", ["~method.data.passes"], "method.data.kind=own_groups needs method.data.passes"),
         ("rloo", ["alignment.workers.count=2"], "2 workers need backend=process"),
+        ("rloo", ["alignment.staleness=1"], "say method.loss.clip=0.2, or alignment.staleness=0"),
+        ("grpo", ["alignment.staleness=1"], "say alignment.workers.backend=process, or staleness=0"),
+        (
+            "rloo",
+            [
+                *("ranking@method.data.ranking=displacement", "method.data.rewards.step_distance=1"),
+                *("~method.data.ranking.weights", "~method.data.ranking.stride"),
+            ],
+            "step_distance needs a distance that couples moments",
+        ),
         ("grpo", ["method.loss.clip=0"], "method.loss.clip must be above 0, got 0"),
         ("dpa_omf_on_policy", ["method.data.num=3"], "method.data.num=3 needs 6 rollouts of a scene and there are 4"),
         ("dpa_omf_on_policy", ["method.loss.kind=policy_gradient"], "policy_gradient learns from groups"),

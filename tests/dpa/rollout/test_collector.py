@@ -275,25 +275,51 @@ def test_a_collector_goes_on_where_its_state_was_saved(stepwise: Callable) -> No
         assert torch.equal(batch[keys.TOKEN], expected[keys.TOKEN])
 
 
-@pytest.mark.slow
-def test_tasks_that_are_held_back_are_not_begun_until_they_are_let_go(stepwise: Callable, collect: Callable) -> None:
-    collector, batches = stepwise(PROCESSES), []
-    collector.hold_at(2)
-    iterator = iter(collector)
-    batches += [next(iterator), next(iterator)]
-    assert not collector._running and not collector._made, "no worker is ahead"
-    collector.hold_at(4)
+@pytest.mark.parametrize("workers", [None, pytest.param(PROCESSES, marks=pytest.mark.slow)])
+def test_tasks_may_come_one_by_one(
+    stepwise: Callable, collect: Callable, model: MotionLM, workers: Workers | None
+) -> None:
+    whole = stepwise(workers)
+    tasks = list(whole._tasks.values())
+    collector = RolloutCollector(whole.job, tasks[:1], workers)
+    batches, iterator = [], iter(collector)
+    for task in tasks[1:]:
+        batches.append(next(iterator))
+        assert not collector._running and not collector._made, "no worker has anything to do"
+        collector.add([task])
     batches += iterator
+    assert len(collector) == 4
     assert_same(tokens_of(batches, 2), collect())
 
 
-def test_asking_for_a_task_that_is_held_back_is_an_error(stepwise: Callable) -> None:
-    collector = stepwise()
-    collector.hold_at(1)
-    iterator = iter(collector)
-    next(iterator)
-    with pytest.raises(ValueError, match="the collector is held at task 1; say hold_at with a later one first"):
-        next(iterator)
+@pytest.mark.slow
+@pytest.mark.parametrize("bound", [0, 1])
+def test_batches_that_workers_made_ahead_are_kept_within_the_bound_on_staleness(
+    stepwise: Callable, collect: Callable, model: MotionLM, bound: int
+) -> None:
+    before, weights = collect(), other_weights(model)
+    whole = stepwise()
+    collector = RolloutCollector(whole.job, list(whole._tasks.values()), PROCESSES, max_staleness=bound)
+    batches, ages = [], []
+    for batch in collector:
+        if not batches:
+            while collector._running:  # they go on with what is known, so all else is made ahead
+                collector._feed()
+                collector._take(*collector._crew.wait())
+            collector.update_policy_weights_(weights)
+        batches.append(batch)
+        ages.append(collector.staleness)
+    model.load_state_dict(weights)
+    after = collect()
+    found = tokens_of(batches, 2)
+    kept = after if bound == 0 else before
+    assert_same(found, {scene: (before if place == 0 else kept)[scene] for place, scene in enumerate(found)})
+    assert ages == [0] + [bound] * 3
+
+
+def test_a_bound_below_0_is_refused(stepwise: Callable) -> None:
+    with pytest.raises(ValueError, match="max_staleness must be 0 or more, got -1"):
+        RolloutCollector(stepwise().job, max_staleness=-1)
 
 
 def test_unknown_weights_are_refused(stepwise: Callable) -> None:
