@@ -219,9 +219,9 @@ class OnPolicyStep:
             yield group_batch([(rolled[row], graded[row]) for row in rows], some).to(self.device), share
 
     def _graded(self, one: Rolled) -> Tensor:
-        """``[K, A, T]``: advantages of a scene's rollouts."""
-        reward = sum(weight * one.ranked[keys.REWARDS, name] for name, weight in self.rewards.items())
-        return advantages(reward[None], baseline=self.data.baseline, scale=self.data.scale)[0]
+        """``[K, A, T]``: advantages of a scene's rollouts; of several rewards each is scaled by itself."""
+        how = {"baseline": self.data.baseline, "scale": self.data.scale}
+        return sum(w * advantages(one.ranked[keys.REWARDS, name][None], **how)[0] for name, w in self.rewards.items())
 
     def _pairs(self, rolled: list[Rolled], step: int) -> Iterator[tuple[TensorDict, float]]:
         """Pairs of rollouts, each part with its share of those of all ranks."""
