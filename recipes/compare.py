@@ -62,7 +62,7 @@ def compare(cfg: DictConfig) -> dict[str, Any]:
             train_policies(cfg, stages)
             chosen = choose(cfg, stages)
             measure(cfg, stages, chosen)
-        found = summarise_experiment(cfg, splits, chosen, stages.seconds) | stages.made | {"command": made["command"]}
+        found = summarise_experiment(cfg, splits, chosen, stages) | stages.made | {"command": made["command"]}
         path, pictures = runs.experiment(cfg.experiment.name), {}
         write_json(path, found)
         if cfg.pictures.scenes:

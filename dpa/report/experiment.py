@@ -110,6 +110,7 @@ class Experiment:
         curves: run folders by method and seed, relative to the folder of the study.
         budget: for each method that is trained the optimiser ``steps`` of one run, the ``rollouts`` read in them, and
             the policy it ``start``s from; a further round counts those before it.
+        compute: worker-seconds of one run of a method, ``before`` its training and in ``training``.
         stages: worker-seconds of its own jobs, by stage.
         worker_seconds: of all of them.
         config: of the run.
@@ -144,6 +145,7 @@ class Experiment:
     axis: Axis | None
     curves: Mapping[str, Mapping[str, str]]
     budget: Mapping[str, Mapping[str, Any]]
+    compute: Mapping[str, Mapping[str, float]]
     stages: Mapping[str, float]
     worker_seconds: float
     config: Mapping[str, Any]
@@ -276,6 +278,7 @@ def read_experiment(path: str | Path) -> Experiment:
         chosen={method: _decoding(decoding) for method, decoding in content["chosen"].items()},
         at_common=Comparison(content["rows"], content["paired"], steps=content["steps"]["common"]),
         own_best=Comparison(own["rows"], own["paired"], own["versus"], content["steps"]["own_best"]),
+        compute=content.get("compute", {}),
         axis=None if axis is None else Axis(**{name: axis[name] for name in AXIS}),
         **made,
     )

@@ -14,12 +14,13 @@ from matplotlib.ticker import FixedLocator, NullLocator
 from dpa.report.canvas import INK, QUIET, blank_figure, calm, save_figure
 from dpa.report.charts import Chart, palette
 from dpa.report.experiment import Experiment
+from dpa.report.sections.compute import compute_charts
 from dpa.report.sections.likelihood import training_charts
 from dpa.report.sections.results import matched_curves
 from dpa.report.sections.scaling import scaling_charts
 from dpa.report.study import Evaluations
 
-FIGURES = ("sharpness", "scaling", "likelihood", "health")
+FIGURES = ("sharpness", "scaling", "compute", "likelihood", "health")
 """Names of :func:`experiment_charts`."""
 DASHES = {None: "-", "solid": "-", "dot": ":", "dash": "--"}
 POINT = 0.75
@@ -34,7 +35,8 @@ def experiment_charts(experiment: Experiment, folder: Path) -> dict[str, list[Ch
         folder: of the study.
 
     Returns:
-        ``sharpness``: realism over the spread of rollouts; ``scaling``: figure 7 of the paper; ``likelihood``: its
+        ``sharpness``: realism over the spread of rollouts; ``scaling``: figure 7 of the paper; ``compute``:
+        realism over worker minutes; ``likelihood``: its
         figures 4 and 6; ``health``: logits, saturation, KL, entropy and pair accuracy along training.
     """
     colours = palette(experiment.methods)
@@ -42,6 +44,7 @@ def experiment_charts(experiment: Experiment, folder: Path) -> dict[str, list[Ch
     charts = (
         matched_curves(experiment, colours, Evaluations(folder)),
         scaling_charts(experiment, colours),
+        compute_charts(experiment, colours),
         likelihood,
         health,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import compress
+from statistics import fmean
 from typing import Any, NamedTuple
 
 from omegaconf import DictConfig
@@ -12,7 +13,7 @@ from dpa.policy import Decoding
 from dpa.report.experiment import read_json
 from dpa.report.statistics import compare_methods
 from dpa.report.table import REFERENCE
-from recipes.alignment.data import ROLLED, num_candidates
+from recipes.alignment.data import ON_POLICY, ROLLED, num_candidates
 from recipes.alignment.draws import num_drawn
 from recipes.alignment.likelihoods import PROBED
 from recipes.common.cli import plain
@@ -21,6 +22,7 @@ from recipes.evaluate import SCENE_FIGURES, mean_known
 from recipes.experiment.jobs import runs_of
 from recipes.experiment.methods import behind, setup_of
 from recipes.experiment.runs import SNAPSHOT, Run, method_of
+from recipes.experiment.stages import Stages
 
 TOLD = ("name", "title", "paper", "question", "headline", "axis", "split", "published")
 """What an experiment says of itself."""
@@ -130,9 +132,7 @@ class Results:
         return read_json(self.runs.evaluation(seed, run, self.split))["per_scene"]["realism"]
 
 
-def summarise_experiment(
-    cfg: DictConfig, splits: Splits, chosen: Chosen, stages: Mapping[str, float]
-) -> dict[str, Any]:
+def summarise_experiment(cfg: DictConfig, splits: Splits, chosen: Chosen, stages: Stages) -> dict[str, Any]:
     """The content of ``experiments/<name>.json``.
 
     ``rows`` and ``paired`` compare at the common decoding, and show the reference at the others of the grid beside
@@ -144,7 +144,7 @@ def summarise_experiment(
         cfg: of the experiment.
         splits: scenes.
         chosen: what stands for each method, the reference first.
-        stages: worker-seconds of each stage.
+        stages: that were run, with their account.
     """
     experiment, methods = plain(cfg.experiment), list(chosen.best)
     common, grid = Decoding(*cfg.decoding.common), [Decoding(*each) for each in cfg.decoding.grid]
@@ -182,8 +182,9 @@ def summarise_experiment(
             for method in cfg.methods
         },
         "budget": {method: budget(cfg, method) for method in cfg.methods},
-        "stages": dict(stages),
-        "worker_seconds": sum(stages.values()),
+        "compute": {method: compute(cfg, method, stages.account) for method in cfg.methods},
+        "stages": stages.seconds,
+        "worker_seconds": sum(stages.seconds.values()),
         "config": plain(cfg),
     }
 
@@ -200,6 +201,39 @@ def budget(cfg: DictConfig, method: str) -> dict[str, Any]:
         "rollouts": sum(steps_of(cfg, run) * _read_in_step(cfg, run) for run in runs),
         "start": setup_of(cfg, method).start,
     }
+
+
+def compute(cfg: DictConfig, method: str, account: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
+    """Worker-seconds of one method after the reference, means over seeds: rolling out, ranking and training.
+
+    Runs that it goes on from and the expert that it learns from count; what methods share counts for each of them.
+
+    Args:
+        cfg: of the experiment.
+        method: of it.
+        account: of the stages, see :class:`~recipes.experiment.stages.Stages`.
+
+    Returns:
+        ``before`` the training can begin, for all that was rolled out and ranked for it or trained to start from, and
+        ``training``, which of a method that rolls out by itself holds its rollouts and their ranking.
+    """
+    earlier = set()
+    for run in behind(cfg, method):
+        setup = setup_of(cfg, run)
+        if cfg.methods[run].data.kind not in ON_POLICY:
+            rolled = {f"collect {{seed}} train {source}" for source in {setup.start, setup.expert} - {None}}
+            stages = ("collect",) if setup.ranking is not None else ("collect", "rank")
+            earlier |= {(stage, job) for stage in stages for job in rolled}
+        if setup.ranking is not None:
+            earlier.add(("rank", f"rank {{seed}} {setup.start} {setup.ranking}"))
+        if run != method:
+            earlier.add(("align", f"align {{seed}} {run}"))
+
+    def mean(stage: str, job: str) -> float:
+        return fmean(account.get(stage, {}).get(job.format(seed=seed), 0.0) for seed in cfg.seeds)
+
+    before = sum(mean(*each) for each in sorted(earlier))
+    return {"before": before, "training": mean("align", f"align {{seed}} {method}")}
 
 
 def _read_in_step(cfg: DictConfig, method: str) -> int:

@@ -23,7 +23,7 @@ from recipes.experiment.methods import drawing_seed, read_setups, setup_of
 from recipes.experiment.pool import Workers
 from recipes.experiment.runs import Run
 from recipes.experiment.stages import Stages, alone_in, read_account
-from recipes.experiment.summary import Results, budget
+from recipes.experiment.summary import Results, budget, compute
 
 EXPERIMENTS = sorted(path.stem for path in (Path(CONFIG["config_path"]) / "experiment").glob("*.yaml"))
 FURTHER = "+experiment.setup.dpa_omf={start:dpa_adef}"
@@ -308,6 +308,27 @@ def test_snapshots_of_a_longer_alignment_lie_as_far_along() -> None:
     cfg = configuration("experiment=rounds")
     longer = setup_of(cfg, "omf_twice").merged(cfg.alignment)
     assert (longer.steps, list(longer.snapshots)) == (300, [150])
+
+
+def test_compute_counts_what_came_before_a_method_and_its_own_training() -> None:
+    rounds = configuration("experiment=rounds", "seeds=[0,1]")
+    account = {
+        "collect": {"collect 0 train reference": 10.0, "collect 1 train reference": 30.0,
+                    "collect 0 tune reference": 99.0, "collect 0 train dpa_omf": 7.0, "collect 1 train dpa_omf": 7.0},
+        "rank": {"collect 0 train reference": 1.0, "collect 1 train reference": 3.0},
+        "align": {"align 0 dpa_omf": 100.0, "align 1 dpa_omf": 200.0, "align 0 omf_round_2": 50.0,
+                  "align 1 omf_round_2": 60.0},
+    }  # fmt: skip
+    assert compute(rounds, "dpa_omf", account) == {"before": 20 + 2, "training": 150}
+    assert compute(rounds, "omf_round_2", account) == {"before": 20 + 2 + 7 + 150, "training": 55}
+    other = configuration("experiment=baselines", "seeds=[0]", "+rankings.mine.stride=5",
+                          "+experiment.setup.dpa_omf.ranking=mine")  # fmt: skip
+    account["rank"]["rank 0 reference mine"] = 4.0
+    account["align"] |= {"align 0 cat_k": 5.0}
+    assert compute(other, "dpa_omf", account) == {"before": 10 + 4, "training": 100}, (
+        "its own ranking in place of the other"
+    )
+    assert compute(other, "cat_k", account) == {"before": 0, "training": 5}, "it rolls out by itself"
 
 
 def test_a_budget_counts_what_a_method_starts_from_and_whom_it_learns_from() -> None:

@@ -27,6 +27,7 @@ from dpa.report.markup import (
 )
 from dpa.report.matched import ABOUT_SHARPNESS, SHARPNESS, matched_difference, reference_line, sharpness_rows
 from dpa.report.paired import paired_figure, quiet_change
+from dpa.report.sections.compute import compute_charts
 from dpa.report.sections.likelihood import likelihood_table
 from dpa.report.sections.origin import code_of
 from dpa.report.sections.safety import safety_tables
@@ -58,6 +59,7 @@ def experiment_section(experiment: Experiment, colours: Mapping[str, str], evalu
         differences(experiment),
         versus(experiment),
         *scaling_charts(experiment, colours),
+        *compute_charts(experiment, colours),
         *matched_curves(experiment, colours, evaluations),
     ]
     about = [

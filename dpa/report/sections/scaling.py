@@ -7,7 +7,7 @@ from typing import Any
 
 from dpa.report.charts import Chart, Line, curves, lines
 from dpa.report.experiment import Comparison, Experiment
-from dpa.report.table import REFERENCE, difference, mean_over_seeds, number
+from dpa.report.table import difference, mean_over_seeds, number
 
 COLOURS, DASHES = ("#2a78b5", "#c79a1b"), ("solid", "dot")
 """Of what is scaled, for the comparisons of an experiment."""
@@ -43,14 +43,14 @@ def _against_axis(experiment: Experiment) -> list[Chart]:
                 hover=[
                     lines(
                         f"{experiment.labels[entry['method']]}, {kind}",
-                        *_told(entry),
+                        *told(entry),
                         f"{axis.name}: {axis.values[entry['method']]:g}",
                     )
                     for entry in entries
                 ],
                 dash=dash,
                 markers=8,
-                error=_errors(entries),
+                error=errors(entries),
             )
         )
     title = f"Realism against {axis.name}"
@@ -73,10 +73,11 @@ def _against_kl(experiment: Experiment, colours: Mapping[str, str]) -> list[Char
         if experiment.axis is not None and scaled:
             name, values = f"{experiment.axis.name}, {kind}", experiment.axis.values
             line = _drift(experiment, scaled, kl, name, BEHIND if bases else colour, dash)
-            told = [f"{values[entry['method']]:g}" for entry in scaled]
-            content.append(line._replace(error=_errors(scaled), text=told))
+            text = [f"{values[entry['method']]:g}" for entry in scaled]
+            content.append(line._replace(error=errors(scaled), text=text))
         for base in bases:
-            if found := _snapshots(experiment, comparison, base, kl):
+            members = [m for m in experiment.methods if m.partition("@")[0] == base and kl[m] is not None]
+            if found := snapshots(comparison, members):
                 name = f"{experiment.labels[base]}, {kind}"
                 content.append(_from_reference(_drift(experiment, found, kl, name, colours[base], dash)))
     caption = "".join(
@@ -97,7 +98,7 @@ def _drift(
 ) -> Line:  # fmt: skip
     """Differences of realism over the KL of their methods."""
     hover = [
-        lines(experiment.labels[entry["method"]], *_told(entry), f"KL {number(kl[entry['method']], 4)}")
+        lines(experiment.labels[entry["method"]], *told(entry), f"KL {number(kl[entry['method']], 4)}")
         for entry in entries
     ]
     at = [kl[entry["method"]] for entry in entries]
@@ -119,7 +120,7 @@ def _scaled(experiment: Experiment, comparison: Comparison) -> list[Mapping[str,
     )
 
 
-def _errors(entries: Sequence[Mapping[str, Any]]) -> tuple[list[float], list[float]]:
+def errors(entries: Sequence[Mapping[str, Any]]) -> tuple[list[float], list[float]]:
     """How far intervals reach up and down."""
     return (
         [entry["ci95"][1] - entry["realism_difference"] for entry in entries],
@@ -127,18 +128,16 @@ def _errors(entries: Sequence[Mapping[str, Any]]) -> tuple[list[float], list[flo
     )
 
 
-def _snapshots(
-    experiment: Experiment, comparison: Comparison, base: str, kl: Mapping[str, float | None]
-) -> list[Mapping[str, Any]]:
+def snapshots(comparison: Comparison, policies: Sequence[str]) -> list[Mapping[str, Any]]:
     """Differences of a method's snapshots and of the method itself, in order of their steps."""
-    members = [m for m in experiment.methods if m.partition("@")[0] == base and m != REFERENCE and kl[m] is not None]
-    members.sort(key=lambda method: (not method.partition("@")[1], int(method.partition("@")[2] or 0)))
-    return [entry for method in members if (entry := comparison.entry(method)) is not None]
+    ordered = sorted(policies, key=lambda policy: (not policy.partition("@")[1], int(policy.partition("@")[2] or 0)))
+    return [entry for policy in ordered if (entry := comparison.entry(policy)) is not None]
 
 
 def _mean_kl(experiment: Experiment, method: str) -> float | None:
     return mean_over_seeds([row.get("kl") for row in experiment.likelihood if row["method"] == method])
 
 
-def _told(entry: Mapping[str, Any]) -> Sequence[str]:
+def told(entry: Mapping[str, Any]) -> Sequence[str]:
+    """A difference with its interval, and what it is over."""
     return (difference(entry["realism_difference"], entry["ci95"]), f"{entry['n_seeds']} seeds, over {entry['over']}")

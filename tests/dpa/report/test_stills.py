@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,9 @@ from matplotlib.axes import Axes
 from PIL import Image
 
 from dpa.report.canvas import blank_figure
-from dpa.report.charts import Chart, Line, curves
+from dpa.report.charts import Chart, Line, curves, palette
+from dpa.report.experiment import read_experiment
+from dpa.report.sections.compute import compute_charts
 from dpa.report.stills import FIGURES, _draw, draw_charts, experiment_charts
 from dpa.report.study import read_study
 from recipes.report import report
@@ -32,10 +35,27 @@ def test_an_experiment_has_the_figures_that_its_page_has(runs: Path) -> None:
     study = read_study(runs)
     found = {name: list(experiment_charts(each, runs)) for name, each in study.experiments.items()}
     assert found == {
-        "methods": ["sharpness", "likelihood", "health"],
+        "methods": ["sharpness", "compute", "likelihood", "health"],
         "scaling": list(FIGURES),
         "steps": list(FIGURES),
     }
+
+
+def test_realism_stands_over_the_minutes_that_a_method_took_until_then(runs: Path) -> None:
+    found = read_experiment(runs / "experiments/steps.json")
+    (chart,) = experiment_charts(found, runs)["compute"]
+    axes = drawn(chart)
+    steps = found.own_best.steps
+    for line in axes.get_lines():
+        base = next((m for m in found.compute if found.labels[m] == line.get_label()), None)
+        if base is None:
+            continue
+        policies = sorted((m for m in found.methods if m.partition("@")[0] == base), key=lambda m: steps[m])
+        assert line.get_xdata() == pytest.approx([5 + 10 * steps[m] / steps[base] for m in policies])
+        gains = [found.own_best.entry(m)["realism_difference"] for m in policies]
+        assert line.get_ydata() == pytest.approx(gains)
+    assert {line.get_label() for line in axes.get_lines()} >= {found.labels[m] for m in found.compute}
+    assert not compute_charts(replace(found, compute={}), palette(found.methods)), "of older results nothing is known"
 
 
 def test_lines_have_their_values_gaps_names_and_colours() -> None:
@@ -84,7 +104,7 @@ def test_a_figure_is_drawn_by_name_and_one_that_is_not_there_is_told(runs: Path,
     report(runs, tmp_path / "differences.png", "methods")
     report(runs, tmp_path / "sharpness.png", "methods", "sharpness")
     assert (tmp_path / "sharpness.png").read_bytes() != (tmp_path / "differences.png").read_bytes()
-    told = "--figure=scaling: experiment 'methods' in .* has differences, sharpness, likelihood, health"
+    told = "--figure=scaling: experiment 'methods' in .* has differences, sharpness, compute, likelihood, health"
     with pytest.raises(ValueError, match=told):
         report(runs, tmp_path / "scaling.png", "methods", "scaling")
     with pytest.raises(ValueError, match=r"--figure=health is for a picture.png; tables.md shows all of them"):
