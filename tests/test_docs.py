@@ -48,7 +48,7 @@ from recipes.zoo import make_parser as zoo_parser
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 CONFIG = REPOSITORY / "recipes" / "config"
-PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
+PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
 COMMANDED = [*PAGES, *sorted(CONFIG.rglob("*.yaml")), *sorted((REPOSITORY / "recipes").glob("*.py"))]
 """Files that tell users what to run."""
 NOT_RUN = "<!-- not run by tests/test_docs.py"
@@ -302,6 +302,12 @@ SHOWN = ("kinematic", "interactive", "map_based", "realism", "collision_rate", "
 STUDIES = sorted((REPOSITORY / "docs" / "studies").glob("*.zip"))
 
 
+def results() -> str:
+    """The page of results, and those of the studies that it concludes from."""
+    pages = [REPOSITORY / "docs/results.md", *sorted((REPOSITORY / "docs/studies").glob("*.md"))]
+    return "\n".join(page.read_text(encoding="utf-8") for page in pages)
+
+
 @pytest.fixture(scope="module", params=STUDIES, ids=lambda path: path.stem)
 def study(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Study:
     folder = tmp_path_factory.mktemp(request.param.stem)
@@ -311,7 +317,7 @@ def study(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 @pytest.mark.slow
 def test_the_tables_of_the_results_are_those_of_the_studies_beside_them(study: Study) -> None:
-    told = (REPOSITORY / "docs" / "results.md").read_text(encoding="utf-8")
+    told = results()
     evaluations = Evaluations(study.folder)
     for experiment in study.experiments.values():
         one = set(experiment.chosen.values()) == {experiment.common}  # decoding: both tables would say the same
@@ -359,7 +365,7 @@ def test_the_table_of_pairs_that_return_is_that_of_the_curves_beside_the_results
     curves = sorted(study.folder.glob("seed_*/sweep_3e4/scalars/train/pair_accuracy.csv"))
     seeds = [[value for _, value in read_curve(path.parents[2], "train/pair_accuracy")] for path in curves]
     passes = [[fmean(seed[first : first + 50]) for seed in seeds] for first in range(0, 300, 50)]
-    told = (REPOSITORY / "docs" / "results.md").read_text(encoding="utf-8")
+    told = results()
     assert [len(seed) for seed in seeds] == [300] * 5
     for label, of in (("ranked right before the step, mean of five seeds", fmean), ("smallest seed", min)):
         assert f"| {label} | {' | '.join(number(of(each), 3) for each in passes)} |" in told
@@ -374,7 +380,7 @@ STUDIED_BY = {
 
 def options_told(source: str, experiment: str) -> DictConfig:
     """The configuration of the command by which the page of results runs an experiment."""
-    told = (REPOSITORY / "docs" / "results.md").read_text(encoding="utf-8")
+    told = results()
     config, pattern = STUDIED_BY[source]
     commands = re.findall(rf"^ +python -m recipes.compare {pattern}$", told, re.MULTILINE)
     with initialize_config_dir(str(CONFIG), version_base="1.3"):
@@ -427,7 +433,7 @@ RANKINGS = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("study", "name"), RANKINGS, indirect=["study"])
 def test_the_tables_of_a_study_of_rankings_are_those_of_the_values_of_its_scenes(study: Study, name: str) -> None:
-    told = (REPOSITORY / "docs" / "results.md").read_text(encoding="utf-8")
+    told = results()
     summary, folder = study.summaries[name], study.folder / name
     policies = {policy: folder / f"{policy.replace('/', '_')}.json" for policy in summary["made"]["policies"]}
     measured = {policy: json.loads(path.read_text())["per_scene"] for policy, path in policies.items()}

@@ -146,7 +146,7 @@ def realism_of(
     """Score rollouts of several scenes, many at a time; the arguments are those of :func:`realism`, one of each scene.
 
     Scenes in one batch share the cost of starting each operation. That is for GPUs; on a CPU one scene at a time is
-    faster, as its working set stays in the cache (docs/results.md).
+    faster, as its working set stays in the cache (docs/studies/speed.md).
 
     Args:
         scenes: uncollated, all on one device.

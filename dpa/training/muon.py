@@ -19,7 +19,7 @@ COEFFICIENTS = (3.4445, -4.7750, 2.0315)
 ROUNDS = 5
 RMS = 0.6
 """Root mean square of the entries of a step of matrices at a learning rate of 1. A step of AdamW has about 0.2 (Liu et
-al. 2025); matrices bear three times as much, other parameters diverge there (docs/results.md)."""
+al. 2025); matrices bear three times as much, other parameters diverge there (docs/studies/references.md)."""
 
 
 def orthogonalised(matrix: Tensor, rounds: int = ROUNDS) -> Tensor:
