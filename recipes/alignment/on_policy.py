@@ -135,7 +135,7 @@ class OnPolicyStep:
         Returns:
             What the loss logs in the last pass, ``gradient_norm`` before clipping, what the rollouts are like
             (``rollout_distance``, ``rollout_ade`` and ``rollout_spread`` [m], ``rollout_pair_accuracy``: how often the
-            nearer of a pair of them, nearest against farthest, is the likelier one, and each reward by its name), the
+            nearer of a pair of them, nearest against farthest, is the likelier one), the rewards (``reward_NAME``), the
             mean ``staleness`` of their weights [steps], and how long they and what is learnt from them take
             (``seconds_rollout``, ``seconds_learning``).
         """
@@ -191,7 +191,7 @@ class OnPolicyStep:
         told = [self._told_of(one) for one in rolled]
         sums = torch.tensor([*(sum(each[name] for each in told) for name in told[0]), len(told)], dtype=torch.float64)
         *totals, count = self.ranks.sum(sums).tolist()
-        return {f"rollout_{name}": total / count for name, total in zip(told[0], totals, strict=True)}
+        return {name: total / count for name, total in zip(told[0], totals, strict=True)}
 
     def _told_of(self, one: Rolled) -> dict[str, float]:
         """What a scene's rollouts are like; rewards are those of whole episodes, means over agents that were moved."""
@@ -199,13 +199,14 @@ class OnPolicyStep:
         likely = (ranked[keys.SAMPLE_LOG_PROB] * one.token_valid).sum((-1, -2))
         order, pairs = ranked[keys.RANK].argsort(), max(1, len(likely) // 4)
         nearer, farther = likely[order[:pairs]], likely[order[-pairs:].flip(0)]
-        paid = {name: float(ranked[keys.REWARDS, name][:, moved, 0].mean()) for name in self.rewards if moved.any()}
+        each = moved / moved.sum().clamp(min=1)
+        paid = {name: ranked[keys.REWARDS, name][..., 0].mean(0) for name in self.rewards}
         return {
-            "distance": float(ranked[keys.DISTANCE].mean()),
-            "ade": float(ranked[keys.ADE].mean()),
-            "spread": float(ranked[keys.SPREAD][moved].mean()) if moved.any() else 0.0,
-            "pair_accuracy": float((nearer > farther).float().mean()),
-            **(paid or dict.fromkeys(self.rewards, 0.0)),
+            "rollout_distance": float(ranked[keys.DISTANCE].mean()),
+            "rollout_ade": float(ranked[keys.ADE].mean()),
+            "rollout_spread": float((each * ranked[keys.SPREAD]).sum()),
+            "rollout_pair_accuracy": float((nearer > farther).float().mean()),
+            **{f"reward_{name}": float((each * value).sum()) for name, value in paid.items()},
         }
 
     def _groups(self, rolled: list[Rolled]) -> Iterator[tuple[TensorDict, float]]:

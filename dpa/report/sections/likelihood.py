@@ -29,8 +29,15 @@ HEALTH = {
     "tune/entropy": ("Entropy of the tokens", "entropy per token [nats]"),
     "tune/pair_accuracy": ("Pair accuracy", "share of pairs"),
     "tune/reward_accuracy": ("Reward accuracy", "share of pairs"),
+    "train/rollout_distance": ("Own rollouts of a step: distance to the log", "preference distance"),
+    "train/rollout_spread": ("Own rollouts: how far apart they end", "spread [m]"),
+    "train/rollout_pair_accuracy": ("Own rollouts: pair accuracy", "share of pairs"),
+    "train/seconds_rollout": ("Rolling out and ranking", "seconds of a step"),
+    "train/seconds_learning": ("Learning from it", "seconds of a step"),
 }
 """Title and axis of the figure of a scalar."""
+REWARD = "train/reward_"
+"""Begins the names of scalars that are rewards."""
 POINTS = 40
 """Most points of a curve on the page; longer ones are averaged over blocks of steps."""
 
@@ -133,7 +140,9 @@ def training_charts(
     }
     runs = {method: seeds for method, seeds in runs.items() if seeds}
     charts = [chart for method, seeds in runs.items() for chart in _likelihood(experiment.labels[method], seeds)]
-    return charts, [chart for key in HEALTH for chart in _health(experiment, runs, key, colours)]
+    rewards = sorted({key for seeds in runs.values() for run in seeds for key in run if key.startswith(REWARD)})
+    told = HEALTH | {key: (f"Reward: {key.removeprefix(REWARD)}", "reward of an agent") for key in rewards}
+    return charts, [chart for key, names in told.items() for chart in _health(experiment, runs, key, names, colours)]
 
 
 def _likelihood(label: str, seeds: Sequence[Mapping[str, Curve]]) -> list[Chart]:
@@ -150,16 +159,18 @@ def _since_start(curve: Curve) -> Curve:
 
 
 def _health(
-    experiment: Experiment, runs: Mapping[str, Sequence[Mapping[str, Curve]]], key: str, colours: Mapping[str, str]
-) -> list[Chart]:
+    experiment: Experiment, runs: Mapping[str, Sequence[Mapping[str, Curve]]], key: str, names: tuple[str, str],
+    colours: Mapping[str, str],
+) -> list[Chart]:  # fmt: skip
     content = [
         line
         for method, seeds in runs.items()
         if method != REFERENCE
         for line in _lines(experiment.labels[method], key, seeds, colours[method])
     ]
-    title, axis = HEALTH[key]
-    return [curves(content, title, x="step", y=axis, nonnegative=True, height=260)] if content else []
+    title, axis = names
+    shown = {"x": "step", "y": axis, "nonnegative": not key.startswith(REWARD), "height": 260}
+    return [curves(content, title, **shown)] if content else []
 
 
 def _lines(name: str, key: str, seeds: Sequence[Mapping[str, Curve]], colour: str) -> list[Line]:
