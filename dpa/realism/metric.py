@@ -215,10 +215,7 @@ def realism_of_groups(
     return [_score(measured.of(group), config, features=False) for group in groups]
 
 
-@torch.no_grad()
-def contributions(
-    scene: Scene, simulated: Tensor, config: str | Path | RealismConfig = "2024", *, quirks: bool = True
-) -> Tensor:
+def contributions(measured: Features, config: RealismConfig) -> Tensor:
     """What each evaluated agent of each rollout adds to the realism of the group, all rollouts against all but one.
 
     An entry is the realism of the R rollouts minus what it is when the distributions of this agent are estimated from
@@ -227,38 +224,35 @@ def contributions(
     to that difference to first order. (A distribution that agents share is estimated without the whole rollout.)
 
     Args:
-        scene: one uncollated scene.
-        simulated: ``[R, A, 80, 4]``, see :func:`realism`; R of 2 or more.
-        config: see :func:`realism`.
-        quirks: see :func:`realism`.
+        measured: from :func:`~dpa.realism.measure`, of two rollouts or more.
+        config: that it was measured with.
 
     Returns:
-        ``[R, A]``, 0 of agents that are not evaluated.
+        ``[R, E]``, agents as in ``measured.track_id``.
 
     Raises:
-        ValueError: as for :func:`realism`, or one rollout alone.
+        ValueError: one rollout alone.
 
     Examples:
+        >>> from dpa.realism import compare, measure
         >>> from envs.sources.synthetic import straight_road
-        >>> scene = straight_road(num_vehicles=2)
+        >>> scene, config = straight_road(num_vehicles=2), RealismConfig.load("2024")
         >>> log = torch.cat((scene.agents.position, scene.agents.heading[..., None]), -1)[None, :, 11:]
-        >>> contributions(scene, torch.cat((log, log, log + 50.0))).sum(1).sign()
+        >>> (measured,) = measure([compare(scene, torch.cat((log, log, log + 50.0)), config)], config)
+        >>> contributions(measured, config).sum(1).sign()
         tensor([ 1.,  1., -1.])
     """
-    config, rollouts = _opened(config, quirks), len(simulated)
-    _check(scene, simulated, config, None)
+    rollouts = len(measured.displacement)
     if rollouts < 2:
-        raise ValueError(f"scene {scene.scene_id}: one rollout is a group of its own; give two or more.")
-    (measured,) = measure([compare(scene, simulated.to(scene.agents.position.dtype), config)], config)
+        raise ValueError("one rollout is a group of its own, to which it adds all; measure two or more.")
     others = [torch.tensor([other for other in range(rollouts) if other != each]) for each in range(rollouts)]
-    without = [scores(measured.of(some), config) for some in others]
-    added = simulated.new_zeros(rollouts, len(measured.track_id))
+    without = [scores(measured.of(some.to(measured.displacement.device)), config) for some in others]
+    added = measured.displacement.new_zeros(rollouts, len(measured.track_id))
     for name, (total, count) in scores(measured, config).items():
         left = torch.stack([each[name].total for each in without])
         whole, steps = total.sum(), count.sum().clamp(min=1)
         added += config.weights[name] * ((whole / steps).exp() - ((whole - total + left) / steps).exp())
-    rows = (scene.agents.track_id[scene.agents.present] == measured.track_id[:, None]).nonzero()[:, 1]
-    return simulated.new_zeros(simulated.shape[:2]).index_copy_(1, rows, added)
+    return added
 
 
 def _opened(config: str | Path | RealismConfig, quirks: bool) -> RealismConfig:

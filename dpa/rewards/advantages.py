@@ -17,13 +17,14 @@ def advantages(reward: Tensor, *, baseline: Baseline = "leave_one_out", scale: S
     """How much better each rollout was than the others of its group.
 
     Args:
-        reward: ``[S, K, ...]``, K of 2 or more.
+        reward: ``[S, K]`` of scenes, ``[S, K, A]`` of agents or ``[S, K, A, T]`` of decisions, K of 2 or more.
 
     Keyword Args:
         baseline: the mean of the other K - 1 rollouts (RLOO; Ahmadian et al., 2024), in which the rollout has no part,
             or that of all K (GRPO; Shao et al., 2024), whose advantages are (K - 1) / K of the former.
         scale: none (RLOO, whose gradient is unbiased), or divide by the standard deviation of the group (GRPO), each
-            agent's own where agents have rewards of their own, so that all groups and agents weigh alike. Where that
+            agent's own where agents have rewards of their own, so that all groups and agents weigh alike, and of all
+            its decisions the largest, so that those after which little differs weigh little. Where that
             is below :data:`SMALLEST_SPREAD` there is nothing to prefer, and the advantage is 0.
 
     Returns:
@@ -53,5 +54,7 @@ def advantages(reward: Tensor, *, baseline: Baseline = "leave_one_out", scale: S
         above = above * rollouts / (rollouts - 1)
     if scale == "none":
         return above
-    spread, least = reward.std(1, keepdim=True), SMALLEST_SPREAD * reward.abs().amax(1, keepdim=True)
-    return torch.where(spread > least, above / spread, 0)
+    spread, largest = reward.std(1, keepdim=True), reward.abs().amax(1, keepdim=True)
+    if reward.dim() == 4:
+        spread, largest = (value.amax(-1, keepdim=True) for value in (spread, largest))
+    return torch.where(spread > SMALLEST_SPREAD * largest, above / spread, 0)

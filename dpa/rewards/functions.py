@@ -1,20 +1,22 @@
 """What a rollout is paid: rewards by name, the higher the better.
 
 A reward is a function of an :class:`Outcome`. Some are of a rollout as a whole, some of each agent, some of each
-decision, so that credit reaches what it belongs to. Add one of your own to :data:`REWARDS`, and any YAML can name it.
+decision, so that credit reaches what it belongs to. Add one of your own to :data:`REWARDS`, and any YAML can name it
+(a function of a module, if other processes are to call it).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 
 import torch
 from torch import Tensor
 
 from dpa.ranking import Distance, Ranking
 from dpa.realism import Features, RealismConfig, compare, contributions, measure
+from dpa.realism.tracks import HORIZON
 from dpa.safety import MEASURES, Motion
 from envs.scene import Scene
 
@@ -59,9 +61,8 @@ class Outcome:
 
     @cached_property
     def measured(self) -> Features:
-        """What the realism metric measures of the controlled agents, in ascending order of track id."""
-        config = RealismConfig.load(YEAR)
-        return measure([compare(self.judged, self.trajectories, config)], config)[0]
+        """What the realism metric of :data:`YEAR` measures of the controlled agents, in ascending order of track id."""
+        return measure([compare(self.judged, self.trajectories, judge())], judge())[0]
 
     def by_agent(self, value: Tensor) -> Tensor:
         """``[K, E]`` of :attr:`measured` agents as ``[K, A]``, 0 of all others."""
@@ -72,6 +73,32 @@ class Outcome:
 
 Reward = Callable[[Outcome], Tensor]
 """What follows each decision: ``[K, A, T]``, with one of A or T where all agents or decisions are paid alike."""
+
+
+@cache
+def judge() -> RealismConfig:
+    """The metric behind the rewards of realism and of its events."""
+    return RealismConfig.load(YEAR)
+
+
+def _distance(outcome: Outcome) -> Tensor:
+    """Minus the preference distance of the scene."""
+    return -outcome.ranking.distance[:, None, None]
+
+
+def _agent_distance(outcome: Outcome) -> Tensor:
+    """Minus the preference distance of each agent."""
+    return -outcome.ranking.agent_distance[..., None]
+
+
+def _ade(outcome: Outcome) -> Tensor:
+    """Minus ADE [m]."""
+    return -outcome.ranking.ade[:, None, None]
+
+
+def _realism(outcome: Outcome) -> Tensor:
+    """What each agent of a rollout adds to the realism of its group."""
+    return outcome.by_agent(contributions(outcome.measured, judge()))[..., None]
 
 
 def _step_distance(outcome: Outcome) -> Tensor:
@@ -100,11 +127,11 @@ def _unsafe(name: str, outcome: Outcome) -> Tensor:
 
 
 REWARDS: dict[str, Reward] = {
-    "distance": lambda outcome: -outcome.ranking.distance[:, None, None],
-    "agent_distance": lambda outcome: -outcome.ranking.agent_distance[..., None],
+    "distance": _distance,
+    "agent_distance": _agent_distance,
     "step_distance": _step_distance,
-    "ade": lambda outcome: -outcome.ranking.ade[:, None, None],
-    "realism": lambda outcome: contributions(outcome.judged, outcome.trajectories, YEAR)[..., None],
+    "ade": _ade,
+    "realism": _realism,
     "collision": partial(_event, "collision_per_step"),
     "offroad": partial(_event, "offroad_per_step"),
     **{name: partial(_unsafe, name) for name in MEASURES},
@@ -114,14 +141,35 @@ each agent of a rollout adds to the realism of its group, and minus 1 for events
 
 
 def check_rewards(weights: Mapping[str, float], distance: Distance) -> None:
-    """Refuse rewards that nobody knows, that pay nothing, or that a distance cannot tell.
+    """Refuse rewards that nobody knows, that pay nothing or for the worse, or that a distance cannot tell.
 
     Raises:
         ValueError: the message lists the known ones.
     """
     if unknown := sorted(weights.keys() - REWARDS.keys()):
         raise ValueError(f"there is no reward {unknown[0]!r}; choose among {', '.join(REWARDS)}.")
+    if negative := [name for name, weight in weights.items() if weight < 0]:
+        told = f"the reward {negative[0]} weighs {weights[negative[0]]}"
+        raise ValueError(f"{told}; every reward is the higher the better, so say a weight of 0 or more.")
     if not any(weights.values()):
         raise ValueError(f"all of the rewards {', '.join(weights)} weigh 0; give one of them a weight.")
     if weights.get("step_distance") and not hasattr(distance, "couple"):
         raise ValueError("the reward step_distance needs a distance that couples moments: ranking.kind=preference.")
+
+
+JUDGED = ("realism", "collision", "offroad")
+"""Rewards that are measured over all of :data:`~dpa.realism.tracks.HORIZON`."""
+
+
+def check_horizon(weights: Mapping[str, float], steps: int) -> None:
+    """Refuse rewards of the realism metric for shorter rollouts than it scores.
+
+    Raises:
+        ValueError: so it is.
+    """
+    judged = [name for name in JUDGED if weights.get(name)]
+    if judged and steps != HORIZON:
+        raise ValueError(
+            f"the reward {judged[0]} is of {HORIZON} steps of 0.1 s, and the policy rolls {steps} out; take a policy "
+            "whose context has decision_steps * horizon = 80, or another reward."
+        )

@@ -11,7 +11,7 @@ from torch.nn.functional import pad
 
 from dpa.ranking import Distance
 from dpa.ranking.transform import PAPER_DISTANCE, Ranked, RankRollouts
-from dpa.rewards.functions import REWARDS, Outcome, check_rewards
+from dpa.rewards.functions import Outcome, Reward
 from envs import keys
 from envs.scene import SceneSource
 
@@ -26,11 +26,10 @@ class RewardRollouts(RankRollouts):
         scenes: where the environment's scenes come from.
         num_rollouts: K.
         distance: how rollouts are compared.
-        rewards: weights by name, of :data:`~dpa.rewards.functions.REWARDS`; those of 0 are left out. None at all pay
-            nothing.
+        rewards: that are paid, by name; see :data:`~dpa.rewards.functions.REWARDS`.
 
     Raises:
-        ValueError: as :func:`~dpa.rewards.functions.check_rewards`, and as the ranking.
+        ValueError: as the ranking, or a reward of another shape than ``[K, A or 1, T or 1]``.
     """
 
     def __init__(
@@ -38,19 +37,12 @@ class RewardRollouts(RankRollouts):
         scenes: SceneSource,
         num_rollouts: int,
         distance: Distance = PAPER_DISTANCE,
-        rewards: Mapping[str, float] | None = None,
+        rewards: Mapping[str, Reward] | None = None,
     ) -> None:
         super().__init__(scenes, num_rollouts, distance)
-        if rewards:
-            check_rewards(rewards, distance)
-        self.rewards = [name for name, weight in (rewards or {}).items() if weight]
+        self.rewards = dict(rewards or {})
         self.in_keys = [*self.in_keys, keys.SAMPLING_LOG_PROB]
-        self.out_keys = [
-            *self.out_keys,
-            keys.SAMPLE_LOG_PROB,
-            keys.SPREAD,
-            *((keys.REWARDS, name) for name in self.rewards),
-        ]
+        self.out_keys += [keys.SAMPLE_LOG_PROB, keys.SPREAD, *((keys.REWARDS, name) for name in self.rewards)]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Rank and pay every group: ``[S * K, T]`` -> ``[S]``."""
@@ -69,10 +61,17 @@ class RewardRollouts(RankRollouts):
         return super().entries(ranked, rows, decisions) | {keys.SPREAD: spread, **paid}
 
     def _paid(self, name: str, outcome: Outcome, rows: int) -> Tensor:
-        """``[K, rows, T]``."""
+        """``[K, rows, T]``; nothing where nobody was moved."""
         rollouts, agents = outcome.trajectories.shape[:2]
         paid = outcome.trajectories.new_zeros(rollouts, rows, outcome.decisions)
-        paid[:, :agents] = REWARDS[name](outcome)
+        if outcome.controlled.any():
+            found = self.rewards[name](outcome)
+            if found.dim() != 3:
+                raise ValueError(
+                    f"the reward {name} must be [K, A, T], with 1 for what it does not tell apart, got "
+                    f"{list(found.shape)}."
+                )
+            paid[:, :agents] = found
         return paid
 
 

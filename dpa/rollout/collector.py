@@ -34,8 +34,8 @@ class RolloutCollector(BaseCollector):
 
     A worker that is killed costs the task that it was at: another one does it again. Weights and seed take effect with
     the next batch that is handed out, also where workers are ahead of it, so every crew gives the same batches. With a
-    bound on staleness above 0 batches of workers that are ahead are kept, and tell by :attr:`staleness` how old they
-    are; which they are depends on the clock.
+    bound on staleness above 0 workers go on while the caller does, one task each, what they have made is kept, and
+    :attr:`staleness` tells how old it is; that depends on the clock.
 
     Args:
         job: what is rolled out.
@@ -60,9 +60,14 @@ class RolloutCollector(BaseCollector):
         max_staleness: int = 0,
     ) -> None:
         super().__init__()
-        if max_staleness < 0:
-            raise ValueError(f"max_staleness must be 0 or more, got {max_staleness}.")
         self.job, self.workers, self.max_staleness = job, workers or Workers(), max_staleness
+        if max_staleness < 0:
+            raise ValueError(f"staleness must be 0 or more, got {max_staleness}.")
+        if max_staleness > 0 and self.workers.backend == "local":
+            raise ValueError(
+                f"staleness={max_staleness} needs workers that roll out while the caller goes on, got backend=local; "
+                "say backend=process, or staleness=0."
+            )
         self._tasks, self._known, self._next, self.staleness = dict(enumerate(tasks)), len(tasks), 0, 0
         self._weights: Mapping[str, Tensor] | None = None
         self._crew: Crew | None = None
@@ -71,7 +76,7 @@ class RolloutCollector(BaseCollector):
         return self._known
 
     def add(self, tasks: Sequence[RolloutTask]) -> None:
-        """More tasks, after those that are known; workers that have none begin at once.
+        """More tasks, after those that are known.
 
         Examples:
             >>> from dpa.tokens import VerletTokenizer
@@ -90,7 +95,6 @@ class RolloutCollector(BaseCollector):
         self._known += len(tasks)
         if self._crew is not None:
             self._waiting += numbers  # larger than all others, so it stays a heap
-            self._feed()
 
     def iterator(self) -> Iterator[TensorDictBase]:
         """Batches of the tasks that are left: what the post-processing makes of ``[S * K, T]``."""
@@ -104,6 +108,8 @@ class RolloutCollector(BaseCollector):
                 self.staleness = self._version - version
                 del self._tasks[self._next]
                 self._next += 1
+                if self.max_staleness:
+                    self._feed()  # who is through goes on while the caller does
                 yield batch
         finally:
             self.shutdown()
@@ -197,8 +203,17 @@ class RolloutCollector(BaseCollector):
         return OrderedDict(next=self._next, seed=self.job.seed)
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Go forward to where another collector of the same tasks was; iterate anew."""
+        """Go forward to where another collector of the same tasks was; iterate anew.
+
+        Raises:
+            ValueError: it was at a task that is not known here, or that has been handed out.
+        """
         self.shutdown()
+        if not self._next <= int(state_dict["next"]) <= self._known:
+            raise ValueError(
+                f"the collector is at task {self._next} of {self._known} and cannot go to {state_dict['next']}; make a "
+                "new one with all tasks."
+            )
         self._next = int(state_dict["next"])
         self._tasks = {number: task for number, task in self._tasks.items() if number >= self._next}
         self.job = replace(self.job, seed=int(state_dict["seed"]))

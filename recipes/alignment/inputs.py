@@ -98,10 +98,11 @@ class Inputs:
             alignment: the section.
             seed: of batches.
         """
+        says_nothing = ("pairs_per_scene",) if method.data.kind in ROLLED else ("staleness",)
         return {
             "data": plain(method.data),
             "loss": plain(method.loss),
-            "alignment": deciding(alignment, *OBSERVING, *(("pairs_per_scene",) if method.data.kind in ROLLED else ())),
+            "alignment": deciding(alignment, *OBSERVING, *says_nothing),
             "scenes": fingerprint(self.scenes.subset(self.learnt)),
             "seed": seed,
             "reference": weights_digest(self.model),

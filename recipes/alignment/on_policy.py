@@ -16,7 +16,7 @@ from torch.nn import functional as F
 
 from dpa.policy import ContextOptions, MotionLM, SceneContext
 from dpa.policy.actor import Contexts
-from dpa.rewards import RewardRollouts, advantages
+from dpa.rewards import REWARDS, RewardRollouts, advantages, check_horizon
 from dpa.rollout import RolloutCollector, RolloutJob, RolloutTask, Workers, plan_tasks
 from dpa.rollout.collector import agents_of, rows_within
 from dpa.training.batches import Item, ShuffledOrder, collate_items, micro_batches, with_tokens
@@ -42,11 +42,13 @@ class Rolled(NamedTuple):
         scene: index.
         context: uncollated.
         ranked: its group, of batch size ``[]`` and cut to its own A agents, on the CPU.
+        staleness: steps that the weights behind it lay behind.
     """
 
     scene: int
     context: SceneContext
     ranked: TensorDict
+    staleness: int
 
     @property
     def token_valid(self) -> Tensor:
@@ -102,13 +104,10 @@ class OnPolicyStep:
         self.schedule = make_schedule(self.optimizer, self.passes * options.steps, self.passes * options.warmup)
         self.order = ShuffledOrder(len(scenes), options.scenes_per_step, seed)
         self.workers = build(Workers, options.workers, "alignment.workers")
-        if options.staleness > 0 and self.workers.backend == "local":
-            raise ValueError(
-                f"alignment.staleness={options.staleness} needs workers that roll out while a step learns; say "
-                "alignment.workers.backend=process, or staleness=0."
-            )
         self.most, self.agents = rows_within(options.memory, model, context), agents_of(scenes, None, context)
         decoding, distance = check_rolling(data)
+        check_horizon(self.rewards, context.decision_steps * context.horizon)
+        paid = {name: REWARDS[name] for name in self.rewards}
         job = RolloutJob(
             scenes,
             model,
@@ -116,9 +115,7 @@ class OnPolicyStep:
             decoding=decoding,
             options=context,
             seed=seed,
-            make_postproc=partial(
-                RewardRollouts, num_rollouts=data.num_rollouts, distance=distance, rewards=self.rewards
-            ),
+            make_postproc=partial(RewardRollouts, num_rollouts=data.num_rollouts, distance=distance, rewards=paid),
             device=device,
         )
         self.collector = RolloutCollector(job, (), self.workers, max_staleness=options.staleness)
@@ -134,10 +131,10 @@ class OnPolicyStep:
 
         Returns:
             What the loss logs in the last pass, ``gradient_norm`` before clipping, what the rollouts are like
-            (``rollout_distance``, ``rollout_ade`` and ``rollout_spread`` [m], ``rollout_pair_accuracy``: how often the
-            nearer of a pair of them, nearest against farthest, is the likelier one), the rewards (``reward_NAME``), the
-            mean ``staleness`` of their weights [steps], and how long they and what is learnt from them take
-            (``seconds_rollout``, ``seconds_learning``).
+            (``rollout_distance``, ``rollout_ade`` and ``rollout_spread`` [m], of a policy gradient
+            ``rollout_pair_accuracy``: how often the nearer of a pair of them is the likelier one), the rewards
+            (``reward_NAME``), the ``staleness`` of their weights [steps], and how long they and what is learnt from
+            them take (``seconds_rollout``, ``seconds_learning``).
         """
         start = time.perf_counter()
         rolled = self._roll_out(step)
@@ -147,7 +144,6 @@ class OnPolicyStep:
             figures = accumulate_gradients(self.loss, parts, self.ranks)
             norm = clip_and_step(self.optimizer, self.options.max_norm, self.schedule)
         took = {"seconds_rollout": before - start, "seconds_learning": time.perf_counter() - before}
-        told["staleness"] = self.staleness
         return {**figures, "gradient_norm": norm, **told, **took}
 
     def _roll_out(self, step: int) -> list[Rolled]:
@@ -157,14 +153,12 @@ class OnPolicyStep:
         self.collector.update_policy_weights_()
         for ahead in range(step, min(step + self.options.staleness + 1, self.options.steps)):
             self._begin(ahead)
-        groups, ages = [], []
+        rolled = {}
         for _ in range(self._tasks.pop(step)):
-            groups.extend(next(self._batches))
-            ages.append(self.collector.staleness)
+            groups = next(self._batches)
+            rolled |= {each.scene: each for each in map(self._of_scene, groups)}
         if step == self.options.steps - 1:
             self.collector.shutdown()
-        self.staleness = sum(ages) / len(ages)
-        rolled = {each.scene: each for each in map(self._of_scene, groups)}
         return [rolled[scene] for scene in self._scenes(step)]
 
     def _scenes(self, step: int) -> list[int]:
@@ -184,11 +178,11 @@ class OnPolicyStep:
         rewards = {(keys.REWARDS, name): -2 for name in self.rewards}
         for key, agents in (OF_AGENTS | rewards).items():
             ranked[key] = ranked[key].narrow(agents, 0, len(context.kind))
-        return Rolled(scene, context, ranked)
+        return Rolled(scene, context, ranked, self.collector.staleness)
 
     def _told(self, rolled: list[Rolled]) -> dict[str, float]:
-        """Means over the scenes of all ranks."""
-        told = [self._told_of(one) for one in rolled]
+        """Means over the scenes of all ranks in which somebody was moved."""
+        told = [self._told_of(one) for one in with_tokens(rolled)]
         sums = torch.tensor([*(sum(each[name] for each in told) for name in told[0]), len(told)], dtype=torch.float64)
         *totals, count = self.ranks.sum(sums).tolist()
         return {name: total / count for name, total in zip(told[0], totals, strict=True)}
@@ -196,18 +190,22 @@ class OnPolicyStep:
     def _told_of(self, one: Rolled) -> dict[str, float]:
         """What a scene's rollouts are like; rewards are those of whole episodes, means over agents that were moved."""
         ranked, moved = one.ranked, one.token_valid.any(-1)
-        likely = (ranked[keys.SAMPLE_LOG_PROB] * one.token_valid).sum((-1, -2))
-        order, pairs = ranked[keys.RANK].argsort(), max(1, len(likely) // 4)
-        nearer, farther = likely[order[:pairs]], likely[order[-pairs:].flip(0)]
         each = moved / moved.sum().clamp(min=1)
         paid = {name: ranked[keys.REWARDS, name][..., 0].mean(0) for name in self.rewards}
         return {
             "rollout_distance": float(ranked[keys.DISTANCE].mean()),
             "rollout_ade": float(ranked[keys.ADE].mean()),
             "rollout_spread": float((each * ranked[keys.SPREAD]).sum()),
-            "rollout_pair_accuracy": float((nearer > farther).float().mean()),
+            "staleness": float(one.staleness),
+            **({"rollout_pair_accuracy": self._accuracy(one)} if self.data.kind == "own_groups" else {}),
             **{f"reward_{name}": float((each * value).sum()) for name, value in paid.items()},
         }
+
+    def _accuracy(self, one: Rolled) -> float:
+        """How often the nearer rollout of a pair, nearest against farthest quarter, is the likelier one."""
+        likely = (one.ranked[keys.SAMPLE_LOG_PROB] * one.token_valid).sum((-1, -2))
+        order, pairs = one.ranked[keys.RANK].argsort(), max(1, len(likely) // 4)
+        return float((likely[order[:pairs]] > likely[order[-pairs:].flip(0)]).float().mean())
 
     def _groups(self, rolled: list[Rolled]) -> Iterator[tuple[TensorDict, float]]:
         """Rollouts with their advantages, each part with its share of the tokens of all ranks."""

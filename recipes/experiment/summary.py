@@ -13,7 +13,7 @@ from dpa.policy import Decoding
 from dpa.report.experiment import read_json
 from dpa.report.statistics import compare_methods
 from dpa.report.table import REFERENCE
-from recipes.alignment.data import ON_POLICY, ROLLED, num_candidates
+from recipes.alignment.data import ON_POLICY, RANKED, ROLLED, num_candidates
 from recipes.alignment.draws import num_drawn
 from recipes.alignment.likelihoods import PROBED
 from recipes.common.cli import plain
@@ -204,7 +204,7 @@ def budget(cfg: DictConfig, method: str) -> dict[str, Any]:
 
 
 def compute(cfg: DictConfig, method: str, account: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
-    """Worker-seconds of one method after the reference, means over seeds: rolling out, ranking and training.
+    """Seconds of one method after the reference, one job at a time, means over seeds: rolling out, ranking, training.
 
     Runs that it goes on from and the expert that it learns from count; what methods share counts for each of them.
 
@@ -222,7 +222,8 @@ def compute(cfg: DictConfig, method: str, account: Mapping[str, Mapping[str, flo
         setup = setup_of(cfg, run)
         if cfg.methods[run].data.kind not in ON_POLICY:
             rolled = {f"collect {{seed}} train {source}" for source in {setup.start, setup.expert} - {None}}
-            stages = ("collect",) if setup.ranking is not None else ("collect", "rank")
+            ranked = cfg.methods[run].data.kind in RANKED and setup.ranking is None
+            stages = ("collect", "rank") if ranked else ("collect",)
             earlier |= {(stage, job) for stage in stages for job in rolled}
         if setup.ranking is not None:
             earlier.add(("rank", f"rank {{seed}} {setup.start} {setup.ranking}"))
@@ -230,7 +231,10 @@ def compute(cfg: DictConfig, method: str, account: Mapping[str, Mapping[str, flo
             earlier.add(("align", f"align {{seed}} {run}"))
 
     def mean(stage: str, job: str) -> float:
-        return fmean(account.get(stage, {}).get(job.format(seed=seed), 0.0) for seed in cfg.seeds)
+        names = [job.format(seed=seed) for seed in cfg.seeds]
+        if stage == "rank" and names[0] not in account.get(stage, {}):  # other processes ranked while they collected
+            return 0.0
+        return fmean(account[stage][name] for name in names)
 
     before = sum(mean(*each) for each in sorted(earlier))
     return {"before": before, "training": mean("align", f"align {{seed}} {method}")}

@@ -31,7 +31,8 @@ def test_it_needs_no_preferences_and_tells_what_it_rolls_out(
 ) -> None:
     outcome = run("align", *aligning(options, origin, method, tmp_path))
     assert outcome.status == 0, outcome.err
-    rolled = ("rollout_distance", "rollout_ade", "rollout_spread", "rollout_pair_accuracy", "seconds_rollout")
+    rolled = ["rollout_distance", "rollout_ade", "rollout_spread", "seconds_rollout"]
+    rolled += [] if method == "dpa_omf_on_policy" else ["rollout_pair_accuracy"]
     for curve in (*rolled, "seconds_learning", "staleness", "kl", "entropy"):
         values = [value for _, value in read_curve(tmp_path, f"train/{curve}")]
         assert len(values) == 4 and min(values) >= 0, curve
@@ -49,6 +50,27 @@ def test_a_policy_gradient_comes_nearer_to_the_log(
     assert outcome.status == 0, outcome.err
     distances = [value for _, value in read_curve(tmp_path, "train/rollout_distance")]
     assert sum(distances[-5:]) < 0.9 * sum(distances[:5])
+
+
+@pytest.mark.parametrize(
+    "rewards",
+    [
+        {"realism": 1},
+        {"step_distance": 1, "scale": "group"},
+        {"agent_distance": 0.5, "collision": 1, "wrong_way": 1, "scale": "group"},
+    ],
+)
+def test_it_follows_any_reward_and_tells_what_was_paid(
+    run: Callable, options: Callable, origin: Path, tmp_path: Path, rewards: dict[str, float | str]
+) -> None:
+    scale = rewards.pop("scale", "none")
+    followed = {"agent_distance": 0, **rewards}
+    more = [f"method.data.rewards.{name}={weight}" for name, weight in followed.items()]
+    outcome = run("align", *aligning(options, origin, "rloo", tmp_path, f"method.data.scale={scale}", *more))
+    assert outcome.status == 0, outcome.err
+    paid = {path.stem for path in (tmp_path / "scalars/train").glob("reward_*.csv")}
+    assert paid == {f"reward_{name}" for name in rewards}
+    assert max(value for _, value in read_curve(tmp_path, "train/gradient_norm")) > 0
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -105,7 +127,7 @@ def test_workers_that_roll_out_while_a_step_learns_keep_to_the_bound(
     outcome = run("align", *aligning(options, origin, method, tmp_path, "alignment.steps=8", *crew))
     assert outcome.status == 0, outcome.err
     ages = [value for _, value in read_curve(tmp_path, "train/staleness")]
-    assert ages[0] == 0 and 0 < max(ages) <= 2
+    assert ages[0] == 0 and 0 < max(ages) <= 2 and sum(ages) > 4
 
 
 def test_no_two_steps_roll_out_by_the_same_draws_and_all_workers_have_a_part() -> None:
@@ -126,6 +148,7 @@ def test_no_two_steps_roll_out_by_the_same_draws_and_all_workers_have_a_part() -
         ("rloo", ["method.data.passes=2"], "say method.loss.clip=0.2, or method.data.passes=1"),
         ("rloo", ["method.data.rewards.agent_distance=0"], "weigh 0"),
         ("rloo", ["+method.data.rewards.speed=1"], "there is no reward 'speed'"),
+        ("rloo", ["method.data.rewards.collision=-1"], "the reward collision weighs -1"),
         ("rloo", ["method.data.rewards.ade=much"], "method.data.rewards.ade must be a number, got 'much'"),
         ("rloo", ["method.data.baseline=none"], "method.data.baseline must be leave_one_out or mean, got 'none'"),
         ("rloo", ["method.data.rewards=ade"], "method.data.rewards must be a section, got 'ade'"),

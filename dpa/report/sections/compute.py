@@ -27,14 +27,14 @@ def compute_charts(experiment: Experiment, colours: Mapping[str, str]) -> list[C
         minutes = [(spent["before"] + share * spent["training"]) / 60 for share in shares]
         gains = [entry["realism_difference"] for entry in found]
         hover = [
-            lines(experiment.labels[entry["method"]], *told(entry), f"{number(spent, 1)} minutes")
-            for entry, spent in zip(found, minutes, strict=True)
+            lines(experiment.labels[entry["method"]], *told(entry), f"{number(each, 1)} minutes")
+            for entry, each in zip(found, minutes, strict=True)
         ]
         name = experiment.labels[base]
         content.append(Line(name, minutes, gains, colours[base], hover, markers=7, error=errors(found)))
     caption = (
-        f"Realism minus that of the reference on {experiment.reported}, {experiment.sampled}, over minutes of one "
-        "worker for rolling out, ranking and training, once the reference was there; 95 % intervals."
+        f"Realism minus that of the reference on {experiment.reported}, {experiment.sampled}, over minutes "
+        "of rolling out, ranking and training, one job at a time, once the reference was there; 95 % intervals."
     )
-    shown = {"x": "worker minutes", "y": "difference in realism", "caption": caption, "zero": True}
+    shown = {"x": "minutes", "y": "difference in realism", "caption": caption, "zero": True}
     return [curves(content, "Realism against compute", **shown)] if content else []

@@ -48,6 +48,13 @@ def test_rollouts_that_are_as_good_as_equal_teach_nothing() -> None:
     assert not advantages(torch.tensor([[2.0, 2.0 + 1e-5, 2.0]]), scale="group").any()
 
 
+def test_decisions_after_which_little_differs_weigh_little() -> None:
+    reward = torch.tensor([[4.0, 1e-5], [2.0, 0.0], [0.0, 2e-5]])[None, :, None]  # [1, K, A, T]
+    found = advantages(reward, baseline="mean", scale="group")[0, :, 0]
+    assert found[:, 0].tolist() == pytest.approx([1, 0, -1])
+    assert found[:, 1].abs().max() < 1e-5
+
+
 @pytest.mark.parametrize(
     ("reward", "options", "told"),
     [

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
+
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.envs import TransformedEnv
 
+from dpa.policy import MotionLM
 from dpa.ranking import DisplacementDistance, PreferenceDistance, log_trajectory
-from dpa.realism import realism
-from dpa.rewards import REWARDS, Outcome, check_rewards
+from dpa.realism import realism, realism_of_groups
+from dpa.rewards import REWARDS, Outcome, RewardRollouts, check_horizon, check_rewards
+from dpa.rollout.job import RolloutJob, RolloutWorker
+from dpa.rollout.plan import RolloutTask
+from dpa.tokens import TokenAction, VerletTokenizer
 from envs.scene import Scene
 from envs.sources.synthetic import red_light, straight_road
+from envs.traffic import TrafficEnv
 
 
 def outcome_of(
@@ -123,6 +133,7 @@ def test_a_measure_of_safety_costs_who_does_what_it_is_about() -> None:
     assert not REWARDS["red_light"](outcome_of(nowhere, lagging(nowhere, 0.0, 1.0))).any(), "there is no light"
 
 
+@settings(max_examples=20)
 @given(st.lists(st.floats(0, 30), min_size=2, max_size=4))
 def test_every_reward_is_finite_and_fits_the_group(metres: list[float]) -> None:
     scene = straight_road(2)
@@ -139,8 +150,75 @@ def test_unknown_rewards_none_at_all_and_those_that_a_distance_cannot_tell_are_r
         check_rewards({"speed": 1.0}, distance)
     with pytest.raises(ValueError, match="all of the rewards ade weigh 0"):
         check_rewards({"ade": 0.0}, distance)
+    with pytest.raises(ValueError, match=r"collision weighs -1.0; every reward is the higher the better"):
+        check_rewards({"collision": -1.0}, distance)
+    with pytest.raises(ValueError, match="the reward realism is of 80 steps of 0.1 s, and the policy rolls 40 out"):
+        check_horizon({"distance": 1.0, "realism": 1.0}, 40)
+    check_horizon({"distance": 1.0, "realism": 0.0}, 40)
     with pytest.raises(ValueError, match="step_distance needs a distance that couples moments"):
         check_rewards({"step_distance": 1.0}, DisplacementDistance())
+
+
+def test_the_rewards_of_many_agents_add_up_to_what_a_rollout_adds_to_first_order() -> None:
+    scene = straight_road(4, seed=2)
+    scene.agents.predict[:] = True
+    rollouts = lagging(scene, *torch.linspace(0, 6, 16).tolist(), agent=1)
+    paid = REWARDS["realism"](outcome_of(scene, rollouts))[..., 0].sum(1)
+    groups = [torch.tensor([other for other in range(16) if other != each]) for each in range(16)]
+    whole = realism(scene, rollouts).realism
+    exact = torch.tensor([whole - each.realism for each in realism_of_groups(scene, rollouts, groups)])
+    assert torch.corrcoef(torch.stack((paid, exact)))[0, 1] > 0.99
+    torch.testing.assert_close(paid, exact, atol=0.1 * float(exact.abs().max()), rtol=0)
+
+
+# --- behind a collector ---------------------------------------------------------------------------------------------
+def test_groups_of_scenes_of_other_sizes_have_their_rewards_spread_and_log_probabilities_in_their_rows() -> None:
+    scenes, model = [straight_road(2), straight_road(4, seed=1)], MotionLM("nano", VerletTokenizer())
+    postproc = partial(RewardRollouts, num_rollouts=3, distance=PreferenceDistance(stride=5),
+                       rewards={name: REWARDS[name] for name in ("step_distance", "realism", "ade")})  # fmt: skip
+    job = RolloutJob(scenes, model, num_rollouts=3, make_postproc=postproc)
+    raw = RolloutWorker(replace(job, make_postproc=None)).run(RolloutTask((0, 1), (range(3),)))
+    groups = RolloutWorker(job).run(RolloutTask((0, 1), (range(3),)))
+    assert groups["scene"].tolist() == [0, 1]
+    likely = raw["agents", "sampling_log_prob"].unflatten(0, (2, 3))  # [S, K, T, A]
+    assert torch.equal(groups["sample_log_prob"], likely.movedim(2, -1))
+    paid = groups["rewards"]
+    assert all(value.shape == (2, 3, 4, 16) for value in paid.values())
+    torch.testing.assert_close(-paid["step_distance"][..., 0], groups["agent_distance"])
+    assert torch.equal(paid["ade"][1], -groups["ade"][1, :, None, None].expand(3, 4, 16))
+    assert not any(value[0, :, 2:].any() for value in paid.values()), "two rows of the first scene are padding"
+    last = raw["next", "agents", "recent"][:, -1, :, -1, :2].unflatten(0, (2, 3))  # [S, K, A, 2]
+    spread = last.var(1, correction=0).sum(-1).sqrt()
+    torch.testing.assert_close(groups["spread"][1], spread[1])
+    torch.testing.assert_close(groups["spread"][0, :2], spread[0, :2])
+    assert not groups["spread"][0, 2:].any()
+
+
+def two_rollouts(scene: Scene, **options: str) -> TensorDictBase:
+    """By random tokens."""
+    env = TrafficEnv([scene], num_scenes=1, num_rollouts=2, **options)
+    rolled = TransformedEnv(env, TokenAction(VerletTokenizer())).rollout(16)
+    rolled["agents", "sampling_log_prob"] = torch.zeros_like(rolled["agents", "token"], dtype=torch.float32)
+    return rolled
+
+
+def test_where_nobody_is_moved_nobody_is_paid() -> None:
+    scene = straight_road(3)
+    scene.agents.predict[:] = False
+    env = TransformedEnv(
+        TrafficEnv([scene], num_scenes=1, num_rollouts=2, control="predict"), TokenAction(VerletTokenizer())
+    )
+    rolled = env.rollout(16)
+    rolled["agents", "sampling_log_prob"] = torch.zeros_like(rolled["agents", "token"], dtype=torch.float32)
+    groups = RewardRollouts([scene], 2, rewards=REWARDS)(rolled)
+    assert not any(value.any() for value in groups["rewards"].values())
+
+
+def test_a_reward_of_another_shape_is_refused() -> None:
+    scene = straight_road(2)
+    mine = {"mine": lambda outcome: outcome.ranking.agent_distance}
+    with pytest.raises(ValueError, match=r"the reward mine must be \[K, A, T\], with 1 for what .*, got \[2, 2\]"):
+        RewardRollouts([scene], 2, rewards=mine)(two_rollouts(scene))
 
 
 if __name__ == "__main__":

@@ -318,8 +318,38 @@ def test_batches_that_workers_made_ahead_are_kept_within_the_bound_on_staleness(
 
 
 def test_a_bound_below_0_is_refused(stepwise: Callable) -> None:
-    with pytest.raises(ValueError, match="max_staleness must be 0 or more, got -1"):
+    with pytest.raises(ValueError, match="staleness must be 0 or more, got -1"):
         RolloutCollector(stepwise().job, max_staleness=-1)
+    with pytest.raises(ValueError, match="staleness=1 needs workers that roll out while the caller goes on"):
+        RolloutCollector(stepwise().job, max_staleness=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [1, 2])
+def test_with_a_bound_on_staleness_workers_go_on_while_the_caller_does(stepwise: Callable, count: int) -> None:
+    whole = stepwise()
+    tasks = list(whole._tasks.values())
+    collector = RolloutCollector(whole.job, (), Workers(count, "process"), max_staleness=1)
+    batches, ages = iter(collector), []
+    collector.add(tasks[:count])
+    for step in range(3):
+        collector.update_policy_weights_()
+        collector.add(tasks[:count])  # of the next step
+        for _ in range(count):
+            next(batches)
+            ages.append(collector.staleness)
+        assert not collector._idle, f"step {step}: nobody waits for the caller"
+    collector.shutdown()
+    assert ages == [0] * count + [1] * 2 * count
+
+
+def test_a_collector_goes_forward_alone(stepwise: Callable) -> None:
+    collector = stepwise()
+    before = collector.state_dict()
+    next(iter(collector))
+    for state in (before, {"next": 9, "seed": 0}):
+        with pytest.raises(ValueError, match=f"is at task 1 of 4 and cannot go to {state['next']}"):
+            collector.load_state_dict(state)
 
 
 def test_unknown_weights_are_refused(stepwise: Callable) -> None:
