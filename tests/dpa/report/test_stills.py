@@ -58,6 +58,19 @@ def test_realism_stands_over_the_minutes_that_a_method_took_until_then(runs: Pat
     assert not compute_charts(replace(found, compute={}), palette(found.methods)), "of older results nothing is known"
 
 
+def test_what_a_method_rolled_out_and_was_paid_has_figures_of_its_own(tmp_path: Path) -> None:
+    runs = write_runs(tmp_path)
+    found = read_experiment(runs / "experiments/methods.json")
+    before = {chart.title for chart in experiment_charts(found, runs)["health"]}
+    scalars = runs / found.curves["dpa_omf"]["0"] / "scalars/train"
+    for name, values in (("rollout_spread", (7.5, 6.0)), ("reward_realism", (-0.1, 0.2))):
+        (scalars / f"{name}.csv").write_text("".join(f"{step},{value}\n" for step, value in enumerate(values, 1)))
+    health = {chart.title: drawn(chart) for chart in experiment_charts(found, runs)["health"]}
+    assert health.keys() - before == {"Own rollouts: how far apart they end", "Reward: realism"}
+    (line,) = health["Reward: realism"].get_lines()[:1]
+    assert list(line.get_ydata()) == [-0.1, 0.2] and health["Reward: realism"].get_ylim()[0] < -0.1
+
+
 def test_lines_have_their_values_gaps_names_and_colours() -> None:
     lines = [
         Line("a < b", [0, 1, 2], [0.5, None, 0.7], "#2a78b5", dash="dot", markers=[6, 6, 15]),
