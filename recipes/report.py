@@ -109,7 +109,7 @@ def make_parser() -> argparse.ArgumentParser:
         "--figure",
         choices=(DIFFERENCES, *FIGURES),
         help="figure of picture.png: differences in realism (the default), realism over sharpness, figure 7 (scaling), "
-        "realism over worker minutes (compute), figures 4 and 6 (likelihood), health of the alignment",
+        "realism over minutes (compute), figures 4 and 6 (likelihood), health of the alignment",
     )
     parser.add_argument("--number-scenes", action="store_true", help="results.zip calls scenes by number, not by name")
     return parser

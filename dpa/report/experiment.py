@@ -110,7 +110,8 @@ class Experiment:
         curves: run folders by method and seed, relative to the folder of the study.
         budget: for each method that is trained the optimiser ``steps`` of one run, the ``rollouts`` read in them, and
             the policy it ``start``s from; a further round counts those before it.
-        compute: seconds of one run of a method, ``before`` its training and in ``training``; empty of older results.
+        compute: seconds of one run of a method, ``before`` its training and in the ``steps`` of ``training``; empty of
+            older results.
         stages: worker-seconds of its own jobs, by stage.
         worker_seconds: of all of them.
         config: of the run.
@@ -261,7 +262,7 @@ def read_experiment(path: str | Path) -> Experiment:
     for method, budget in content["budget"].items():
         _check(budget, BUDGET, f"{path}: budget.{method}")
     for method, spent in content.get("compute", {}).items():
-        _check(spent, {"before": NUMBER, "training": NUMBER}, f"{path}: compute.{method}")
+        _check(spent, {"before": NUMBER, "training": NUMBER, "steps": int}, f"{path}: compute.{method}")
     _check_names(content, path)
     _check_lists(content, path)
     axis = content["axis"]

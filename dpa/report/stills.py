@@ -36,7 +36,7 @@ def experiment_charts(experiment: Experiment, folder: Path) -> dict[str, list[Ch
 
     Returns:
         ``sharpness``: realism over the spread of rollouts; ``scaling``: figure 7 of the paper; ``compute``:
-        realism over worker minutes; ``likelihood``: its
+        realism over minutes; ``likelihood``: its
         figures 4 and 6; ``health``: logits, saturation, KL, entropy and pair accuracy along training.
     """
     colours = palette(experiment.methods)

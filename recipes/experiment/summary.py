@@ -215,7 +215,7 @@ def compute(cfg: DictConfig, method: str, account: Mapping[str, Mapping[str, flo
 
     Returns:
         ``before`` the training can begin, for all that was rolled out and ranked for it or trained to start from, and
-        ``training``, which of a method that rolls out by itself holds its rollouts and their ranking.
+        ``training``, which of a method that rolls out by itself holds its rollouts and their ranking; ``steps`` of it.
     """
     earlier = set()
     for run in behind(cfg, method):
@@ -237,7 +237,8 @@ def compute(cfg: DictConfig, method: str, account: Mapping[str, Mapping[str, flo
         return fmean(account[stage][name] for name in names)
 
     before = sum(mean(*each) for each in sorted(earlier))
-    return {"before": before, "training": mean("align", f"align {{seed}} {method}")}
+    training = mean("align", f"align {{seed}} {method}")
+    return {"before": before, "training": training, "steps": steps_of(cfg, method)}
 
 
 def _read_in_step(cfg: DictConfig, method: str) -> int:

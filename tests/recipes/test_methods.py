@@ -319,16 +319,16 @@ def test_compute_counts_what_came_before_a_method_and_its_own_training() -> None
         "align": {"align 0 dpa_omf": 100.0, "align 1 dpa_omf": 200.0, "align 0 omf_round_2": 50.0,
                   "align 1 omf_round_2": 60.0},
     }  # fmt: skip
-    assert compute(rounds, "dpa_omf", account) == {"before": 20 + 2, "training": 150}
-    assert compute(rounds, "omf_round_2", account) == {"before": 20 + 2 + 7 + 150, "training": 55}
+    assert compute(rounds, "dpa_omf", account) == {"before": 20 + 2, "training": 150, "steps": 150}
+    assert compute(rounds, "omf_round_2", account) == {"before": 20 + 2 + 7 + 150, "training": 55, "steps": 150}
     other = configuration("experiment=baselines", "seeds=[0]", "+rankings.mine.stride=5",
                           "+experiment.setup.dpa_omf.ranking=mine")  # fmt: skip
     account["rank"]["rank 0 reference mine"] = 4.0
     account["align"] |= {"align 0 cat_k": 5.0}
-    assert compute(other, "dpa_omf", account) == {"before": 10 + 4, "training": 100}, (
+    assert compute(other, "dpa_omf", account) == {"before": 10 + 4, "training": 100, "steps": 150}, (
         "its own ranking in place of the other"
     )
-    assert compute(other, "cat_k", account) == {"before": 0, "training": 5}, "it rolls out by itself"
+    assert compute(other, "cat_k", account) == {"before": 0, "training": 5, "steps": 150}, "it rolls out by itself"
 
 
 def test_a_budget_counts_what_a_method_starts_from_and_whom_it_learns_from() -> None:

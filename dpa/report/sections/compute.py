@@ -23,7 +23,7 @@ def compute_charts(experiment: Experiment, colours: Mapping[str, str]) -> list[C
         if not found or not spent["training"]:
             continue
         # A snapshot has taken its share of the training, and all that came before it.
-        shares = [comparison.steps[entry["method"]] / comparison.steps[base] for entry in found]
+        shares = [comparison.steps[entry["method"]] / spent["steps"] for entry in found]
         minutes = [(spent["before"] + share * spent["training"]) / 60 for share in shares]
         gains = [entry["realism_difference"] for entry in found]
         hover = [

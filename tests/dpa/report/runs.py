@@ -106,7 +106,7 @@ def write_experiment(
         "axis": axis,
         "curves": {m: {str(seed): curves(folder, m, seed) for seed in SEEDS} for m in others if "@" not in m},
         "budget": {m: {"steps": 60, "rollouts": 960, "start": "reference"} for m in others if "@" not in m},
-        "compute": {m: {"before": 300.0, "training": 600.0} for m in others if "@" not in m},
+        "compute": {m: {"before": 300.0, "training": 600.0, "steps": 60} for m in others if "@" not in m},
         "stages": {"pretrain": 5400.0, "align": 125.0}, "worker_seconds": 5525.0,
         "config": {
             "mark": "<!--{title}-->", "methods": {"dpa_omf": {"loss": DPO}}, **ROLLED,
