@@ -32,7 +32,8 @@ TABLES = {
 }  # fmt: skip
 OF_METHODS = {name for name in TABLES if name.partition("/")[0] not in ("account", "scenes", "learnt", "preferences")}
 PICTURES = {
-    "own_best/differences", "scenes/likely", "figures/sharpness", "figures/likelihood", "figures/health",
+    "own_best/differences", "scenes/likely", "figures/sharpness", "figures/compute", "figures/likelihood",
+    "figures/health",
 }  # fmt: skip
 
 
@@ -186,7 +187,7 @@ def test_the_experiment_along_an_axis_has_its_figure_in_tensorboard(study: Path)
 def test_figures_of_the_page_are_pictures(files: tuple[Path, dict[str, Any]]) -> None:
     folder, _ = files
     names = {path.parent.name for path in (folder / "pictures/figures").rglob("*.png")}
-    assert names == {"sharpness", "likelihood", "health"}, "methods along no axis have none of scaling"
+    assert names == {"sharpness", "compute", "likelihood", "health"}, "methods along no axis have none of scaling"
 
 
 def test_differences_to_another_method_are_numbers_beside_those_to_the_reference(

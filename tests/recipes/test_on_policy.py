@@ -164,7 +164,7 @@ def test_no_two_steps_roll_out_by_the_same_draws_and_all_workers_have_a_part() -
         ("rloo", ["~method.data.passes"], "method.data.kind=own_groups needs method.data.passes"),
         ("rloo", ["alignment.workers.count=2"], "2 workers need backend=process"),
         ("rloo", ["alignment.staleness=1"], "say method.loss.clip=0.2, or alignment.staleness=0"),
-        ("grpo", ["alignment.staleness=1"], "say alignment.workers.backend=process, or staleness=0"),
+        ("grpo", ["alignment.staleness=1"], "staleness=1 needs workers that roll out while"),
         (
             "rloo",
             [
