@@ -23,7 +23,7 @@ SMALL = [
     "alignment.watch_interval=2",
     "alignment.snapshots=[2]",
 ]
-OF_THE_MACHINE = ("stages", "worker_seconds", "versions", "command", "config", "date", "revision", "machine")
+OF_THE_MACHINE = ("compute", "stages", "worker_seconds", "versions", "command", "config", "date", "revision", "machine")
 """What differs between two runs of the same options."""
 
 
