@@ -16,7 +16,7 @@ import torch
 from omegaconf import DictConfig
 
 from dpa.policy import Decoding
-from dpa.ranking import Distance
+from dpa.ranking import Distance, agent_spread
 from dpa.realism import RealismConfig, RealismResult, mean_result, realism
 from dpa.realism.submission import SubmissionWriter, plan_submission
 from dpa.rollout import make_collector
@@ -173,8 +173,7 @@ def standing_moved(scene: Any, trajectories: torch.Tensor) -> float:
 def final_spread(scene: Any, trajectories: torch.Tensor, controlled: torch.Tensor) -> float:
     """How far apart rollouts end, small where sampling is sharp [m] (NaN: no evaluated agent is controlled).
 
-    The root mean square distance of an agent's last position from its mean over rollouts; the mean over evaluated
-    agents that the policy controls.
+    The mean of :func:`dpa.ranking.agent_spread` over evaluated agents that the policy controls.
 
     Args:
         scene: uncollated.
@@ -182,8 +181,7 @@ def final_spread(scene: Any, trajectories: torch.Tensor, controlled: torch.Tenso
         controlled: ``[A]`` bool.
     """
     agents = scene.agents
-    last = trajectories[:, agents.evaluated[agents.present] & controlled, -1, :2]
-    return (last - last.mean(0)).square().sum(-1).mean(0).sqrt().mean().item()
+    return agent_spread(trajectories[:, agents.evaluated[agents.present] & controlled]).mean().item()
 
 
 def mean_known(values: list[float | None]) -> float | None:

@@ -4,7 +4,7 @@
 ``displacement`` is its rival; ``transform`` puts both behind a collector.
 """
 
-from dpa.ranking.displacement import Displacement, average_displacement, final_displacement
+from dpa.ranking.displacement import Displacement, agent_spread, average_displacement, final_displacement
 from dpa.ranking.distance import AGGREGATES, Distance, PreferenceDistance, Ranking, rank_of
 from dpa.ranking.features import FEATURE_SETS, FEATURES, Feature, Motion, log_trajectory, occupancy_features, register
 from dpa.ranking.rival import DisplacementDistance
@@ -26,6 +26,7 @@ __all__ = [
     "Problems",
     "Ranking",
     "Transport",
+    "agent_spread",
     "average_displacement",
     "final_displacement",
     "log_trajectory",

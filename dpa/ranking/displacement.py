@@ -59,6 +59,23 @@ def final_displacement(position: Tensor, log: Tensor, valid: Tensor) -> Displace
     return _over_agents(error.gather(-1, last.expand(len(error), -1)[..., None])[..., 0], valid)
 
 
+def agent_spread(trajectories: Tensor) -> Tensor:
+    """How far apart rollouts end: the root mean square distance of an agent's last position from its mean [m].
+
+    Args:
+        trajectories: ``[R, A, T, 2]`` or more.
+
+    Returns:
+        ``[A]``.
+
+    Examples:
+        >>> agent_spread(torch.tensor([[[[3.0, 0.0]]], [[[-3.0, 0.0]]]]))
+        tensor([3.])
+    """
+    last = trajectories[:, :, -1, :2]
+    return (last - last.mean(0)).square().sum(-1).mean(0).sqrt()
+
+
 def _error(position: Tensor, log: Tensor, valid: Tensor) -> Tensor:
     """Distance from the log in the plane, ``[R, A, T]`` [m]; 0 where the log is not valid."""
     if position.shape[1:3] != log.shape[:2] or valid.shape != log.shape[:2]:

@@ -13,6 +13,7 @@ from torch import Tensor
 from dpa.ranking.displacement import average_displacement
 from dpa.ranking.features import feature_clips, feature_names, feature_weights, log_trajectory, occupancy_features
 from dpa.ranking.transport import Transport, deciding_options, make_solver, transport_cost
+from dpa.ranking.transport.problems import step_cost
 from envs.scene import CURRENT_STEP, STEP_SECONDS, Scene
 
 AGGREGATES: dict[str, Callable[[Tensor], Tensor]] = {
@@ -68,9 +69,7 @@ class Coupled(NamedTuple):
     @property
     def paid(self) -> Tensor:
         """``[R, E, T']``: what each measured step of a rollout pays under the coupling; they sum to the distance."""
-        scaled = (value.double() * self.weights.sqrt() for value in (self.rollouts, self.log))
-        cost = torch.cdist(*scaled, compute_mode="donot_use_mm_for_euclid_dist")
-        return (self.moved.coupling * cost).sum(-1).to(self.rollouts.dtype)
+        return (self.moved.coupling * step_cost(self.rollouts, self.log, self.weights)).sum(-1)
 
 
 class Distance(Protocol):

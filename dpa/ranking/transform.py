@@ -111,10 +111,10 @@ class RankRollouts(Transform):
         distance = torch.stack([ranking.distance for ranking in rankings])
         return {
             keys.DISTANCE: distance,
-            keys.AGENT_DISTANCE: _stacked([ranking.agent_distance for ranking in rankings], rows),
+            keys.AGENT_DISTANCE: stacked([ranking.agent_distance for ranking in rankings], rows),
             keys.ADE: torch.stack([ranking.ade for ranking in rankings]),
-            keys.AGENT_RANKED: _stacked([ranking.agent_ranked for ranking in rankings], rows),
-            keys.AGENT_KIND: _stacked(kinds, rows),
+            keys.AGENT_RANKED: stacked([ranking.agent_ranked for ranking in rankings], rows),
+            keys.AGENT_KIND: stacked(kinds, rows),
             keys.FEATURE_SHARE: torch.stack([ranking.feature_share for ranking in rankings]),
             keys.RANK: rank_of(distance),
         }
@@ -175,6 +175,6 @@ class RankRollouts(Transform):
         return num_agents
 
 
-def _stacked(values: Sequence[Tensor], rows: int) -> Tensor:
+def stacked(values: Sequence[Tensor], rows: int) -> Tensor:
     """One tensor of values ``[..., A]`` of several scenes, padded to the agents of the environment."""
     return torch.stack([pad(value, (0, rows - value.shape[-1])) for value in values])

@@ -7,10 +7,9 @@ from collections.abc import Mapping, Sequence
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
-from torch.nn.functional import pad
 
-from dpa.ranking import Distance
-from dpa.ranking.transform import PAPER_DISTANCE, Ranked, RankRollouts
+from dpa.ranking import Distance, agent_spread
+from dpa.ranking.transform import PAPER_DISTANCE, Ranked, RankRollouts, stacked
 from dpa.rewards.functions import Outcome, Reward
 from envs import keys
 from envs.scene import SceneSource
@@ -57,7 +56,7 @@ class RewardRollouts(RankRollouts):
             (keys.REWARDS, name): torch.stack([self._paid(name, one, rows) for one in outcomes])
             for name in self.rewards
         }
-        spread = torch.stack([pad(_spread(one.trajectories), (0, rows - len(one.controlled))) for one in outcomes])
+        spread = stacked([agent_spread(one.trajectories) for one in outcomes], rows)
         return super().entries(ranked, rows, decisions) | {keys.SPREAD: spread, **paid}
 
     def _paid(self, name: str, outcome: Outcome, rows: int) -> Tensor:
@@ -73,9 +72,3 @@ class RewardRollouts(RankRollouts):
                 )
             paid[:, :agents] = found
         return paid
-
-
-def _spread(trajectories: Tensor) -> Tensor:
-    """``[A]`` [m], of ``[K, A, T * F, 4]``."""
-    last = trajectories[:, :, -1, :2]
-    return (last - last.mean(0)).square().sum(-1).mean(0).sqrt()

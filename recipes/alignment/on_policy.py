@@ -16,6 +16,7 @@ from torch.nn import functional as F
 
 from dpa.policy import ContextOptions, MotionLM, SceneContext
 from dpa.policy.actor import Contexts
+from dpa.preferences import nearest_farthest
 from dpa.rewards import REWARDS, RewardRollouts, advantages, check_horizon
 from dpa.rollout import RolloutCollector, RolloutJob, RolloutTask, Workers, plan_tasks
 from dpa.rollout.collector import agents_of, rows_within
@@ -104,7 +105,7 @@ class OnPolicyStep:
         self.schedule = make_schedule(self.optimizer, self.passes * options.steps, self.passes * options.warmup)
         self.order = ShuffledOrder(len(scenes), options.scenes_per_step, seed)
         self.workers = build(Workers, options.workers, "alignment.workers")
-        self.most, self.agents = rows_within(options.memory, model, context), agents_of(scenes, None, context)
+        self.most, self.sizes = rows_within(options.memory, model, context), partial(agents_of, scenes, options=context)
         decoding, distance = check_rolling(data)
         check_horizon(self.rewards, context.decision_steps * context.horizon)
         paid = {name: REWARDS[name] for name in self.rewards}
@@ -167,7 +168,7 @@ class OnPolicyStep:
     def _begin(self, step: int) -> None:
         """Have the scenes of a step rolled out, unless they are."""
         if step not in self._tasks:
-            sizes = {scene: self.agents[scene] for scene in self._scenes(step)}
+            sizes = self.sizes(self._scenes(step))
             tasks = tasks_of(step, sizes, self.data.num_rollouts, self.most, self.workers.count)
             self._tasks[step] = len(tasks)
             self.collector.add(tasks)
@@ -204,8 +205,8 @@ class OnPolicyStep:
     def _accuracy(self, one: Rolled) -> float:
         """How often the nearer rollout of a pair, nearest against farthest quarter, is the likelier one."""
         likely = (one.ranked[keys.SAMPLE_LOG_PROB] * one.token_valid).sum((-1, -2))
-        order, pairs = one.ranked[keys.RANK].argsort(), max(1, len(likely) // 4)
-        return float((likely[order[:pairs]] > likely[order[-pairs:].flip(0)]).float().mean())
+        (near,), (far,) = nearest_farthest(one.ranked[keys.DISTANCE][None], max(1, len(likely) // 4))
+        return float((likely[near] > likely[far]).float().mean())
 
     def _groups(self, rolled: list[Rolled]) -> Iterator[tuple[TensorDict, float]]:
         """Rollouts with their advantages, each part with its share of the tokens of all ranks."""

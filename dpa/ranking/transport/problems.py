@@ -35,10 +35,8 @@ class Problems:
 
     @property
     def cost(self) -> Tensor:
-        """``[N, T, T']`` ``sqrt(sum_k w_k (x_k - y_k)^2)``, in the features' dtype; computed anew at each call."""
-        # Not the matrix-product form, which cancels digits: distances of 0 must come out as 0.
-        scaled = (value.double() * self.weights.sqrt() for value in (self.x, self.y))
-        return torch.cdist(*scaled, compute_mode="donot_use_mm_for_euclid_dist").to(self.x.dtype)
+        """``[N, T, T']``, see :func:`step_cost`; computed anew at each call."""
+        return step_cost(self.x, self.y, self.weights)
 
     @property
     def x_mass(self) -> Tensor:
@@ -57,6 +55,13 @@ class Problems:
             replace(self, x=x, y=y, x_valid=x_valid, y_valid=y_valid)
             for x, y, x_valid, y_valid in zip(*values, strict=True)
         ]
+
+
+def step_cost(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
+    """``sqrt(sum_k w_k (x_k - y_k)^2)``: ``[..., T, D]`` and ``[..., T', D]`` -> ``[..., T, T']``, in their dtype."""
+    # Not the matrix-product form, which cancels digits: distances of 0 must come out as 0.
+    scaled = (value.double() * weights.sqrt() for value in (x, y))
+    return torch.cdist(*scaled, compute_mode="donot_use_mm_for_euclid_dist").to(x.dtype)
 
 
 class Plan(Protocol):
