@@ -119,14 +119,20 @@ def test_a_run_that_is_cut_goes_on_to_the_same_weights(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("backend", ["process", "ray"])
 def test_processes_that_roll_out_change_rounding_alone(
-    run: Callable, options: Callable, origin: Path, tmp_path: Path
+    run: Callable, options: Callable, origin: Path, tmp_path: Path, backend: str
 ) -> None:
-    crew = ("alignment.workers.backend=process", "alignment.workers.count=2")
-    for name, more in (("alone", ()), ("processes", crew)):
-        outcome = run("align", *aligning(options, origin, "rloo", tmp_path / name, *more))
-        assert outcome.status == 0, outcome.err
-    assert_same(tmp_path / "alone", tmp_path / "processes", atol=1e-5)
+    crew = (f"alignment.workers.backend={backend}", "alignment.workers.count=2")
+    ray = pytest.importorskip("ray") if backend == "ray" else None
+    try:
+        for name, more in (("alone", ()), ("crew", crew)):
+            outcome = run("align", *aligning(options, origin, "rloo", tmp_path / name, *more))
+            assert outcome.status == 0, outcome.err
+    finally:
+        if ray is not None:
+            ray.shutdown()
+    assert_same(tmp_path / "alone", tmp_path / "crew", atol=1e-5)
 
 
 @pytest.mark.slow
