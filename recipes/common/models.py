@@ -113,7 +113,7 @@ def policies_of(cfg: DictConfig) -> dict[str, Path]:
 
     Args:
         cfg: with ``policies``, a path or a list of them, or names in the zoo. A path may have the wildcards of a
-            shell, as in ``runs/study/seed_*/reference/policy.pt``: the references of all seeds of a study.
+            shell, as in ``runs/mine/seed_*/reference/policy.pt``: the references of all seeds of a study.
 
     Returns:
         By the name of their run's folder, or by their whole path where that is not enough; those of a wildcard in

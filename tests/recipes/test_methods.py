@@ -43,9 +43,8 @@ def configuration(*options: str) -> DictConfig:
         ("rounds", "spin_round_2", "adversarial_afd", "preferences_train_of_adversarial_afd", None, {}),
         ("rounds", "omf_thrice", "reference", "preferences_train", None, {"steps": 450}),
         ("losses", "afd_expert", "reference", "preferences_train", "preferences_train_of_sft_best_oa", {}),
-        ("variants", "normalised_more_pairs", "reference", "preferences_train_by_normalised", None,
-         {"pairs_per_scene": 4}),
-        ("step_size", "sweep_3e4", "reference", "preferences_train", None, {"lr": 3e-4}),
+        ("competent", "omf_normalised", "reference", "preferences_train_by_normalised", None, {}),
+        ("competent", "cat_k", "reference", None, None, {"lr": 6e-4}),
     ],
 )  # fmt: skip
 def test_a_method_is_aligned_with_what_its_experiment_says(
@@ -53,7 +52,7 @@ def test_a_method_is_aligned_with_what_its_experiment_says(
     name: str,
     method: str,
     policy: str,
-    preferences: str,
+    preferences: str | None,
     expert: str | None,
     changed: dict[str, float],
 ) -> None:
@@ -64,7 +63,8 @@ def test_a_method_is_aligned_with_what_its_experiment_says(
     jobs.align_job(cfg, 3, method)
     options, data_and_loss, _, start, store, _, folder = given["args"]
     seed = runs_of(cfg).root / "seed_3"
-    assert (start, store, folder) == (seed / policy / "policy.pt", seed / preferences, seed / method)
+    assert (start, folder) == (seed / policy / "policy.pt", seed / method)
+    assert store == (None if preferences is None else seed / preferences)
     assert given["expert"] == (None if expert is None else seed / expert)
     assert data_and_loss == cfg.methods[method]
     own = {key: value for key, value in options.alignment.items() if value != cfg.alignment[key]}
@@ -225,7 +225,7 @@ def test_an_experiment_that_cannot_work_is_refused_before_any_work(options: tupl
         check_experiment(configuration(*options))
 
 
-@pytest.mark.parametrize("config", ["demo", pytest.param("study", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("config", ["demo", pytest.param("driving", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", [name for name in EXPERIMENTS if name != "base"])
 def test_what_the_page_of_the_demo_or_of_a_study_offers_fits_it(name: str, config: str) -> None:
     with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):
@@ -339,8 +339,8 @@ def test_a_budget_counts_what_a_method_starts_from_and_whom_it_learns_from() -> 
     expert = budget(configuration("experiment=losses"), "afd_expert")
     losses = configuration("experiment=losses", "methods.kto.data.num_unpreferred=0.5")
     assert budget(losses, "kto")["rollouts"] == 150 * 6 * (1 + 2), "of twice as many unpreferred ones twice as many"
-    few = configuration("experiment=variants", "methods.combined.data.num=2")
-    assert budget(few, "combined")["rollouts"] == 150 * 6 * 2 * 2, "of two pairs a step cannot take four"
+    few = configuration("alignment.pairs_per_scene=4", "methods.dpa_omf.data.num=2")
+    assert budget(few, "dpa_omf")["rollouts"] == 150 * 6 * 2 * 2, "of two pairs a step cannot take four"
     far = configuration("experiment=losses", "+experiment.setup.afd_expert.start=sft_best_oa")
     assert budget(far, "afd_expert")["steps"] == 300, "SFT is both its start and its expert, and runs once"
     thinned = configuration("experiment=scaling", "alignment.pairs_per_scene=4")
