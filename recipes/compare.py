@@ -2,6 +2,7 @@
 
     python -m recipes.compare scenes=gpudrive scenes.train=DIR scenes.eval=DIR output=runs/real
     python -m recipes.compare experiment=features output=runs/real ...   # another question to the same references
+    python -m recipes.compare scenes=gpudrive ... trained=runs/sumo output=runs/zero_shot       # its policies elsewhere
     make demo                                                            # the first one on SUMO scenes, in minutes
 
 For every seed: pre-train a reference, collect and rank its rollouts, align it with each method, choose each one's
@@ -29,6 +30,7 @@ from recipes.common.scenes import open_splits
 from recipes.experiment.cards import write_scene_cards
 from recipes.experiment.check import check_experiment
 from recipes.experiment.jobs import (
+    adopt_job,
     align_job,
     collect_job,
     evaluate_job,
@@ -59,7 +61,7 @@ def compare(cfg: DictConfig) -> dict[str, Any]:
         write_scene_cards(runs.scenes, splits)
         with Workers(cfg.workers, cfg.threads, spread=cfg.device == "cuda") as workers:
             stages = Stages(workers, runs.stages, made)
-            train_policies(cfg, stages)
+            (train_policies if cfg.trained is None else adopt_policies)(cfg, stages)
             chosen = choose(cfg, stages)
             measure(cfg, stages, chosen)
         found = summarise_experiment(cfg, splits, chosen, stages) | stages.made | {"command": made["command"]}
@@ -69,6 +71,13 @@ def compare(cfg: DictConfig) -> dict[str, Any]:
             pictures["scenes/likely"] = write_players(cfg, splits[cfg.experiment.split], chosen.best)
         log_experiment(cfg, read_experiment(path), pictures)
     return found
+
+
+def adopt_policies(cfg: DictConfig, stages: Stages) -> None:
+    """References and aligned policies of another folder, and ranked rollouts of the reported scenes."""
+    policies = dict.fromkeys([*shown_policies(cfg), *(each for one in checkpoints_of(cfg).values() for each in one)])
+    stages.run("adopt", adopt_job, cfg, [(seed, policy) for policy in policies for seed in cfg.seeds])
+    stages.run("collect", collect_job, cfg, [(seed, cfg.experiment.split, REFERENCE) for seed in cfg.seeds])
 
 
 def train_policies(cfg: DictConfig, stages: Stages) -> None:
@@ -91,9 +100,7 @@ def choose(cfg: DictConfig, stages: Stages) -> Chosen:
 
     What has one checkpoint and one decoding needs no choice, and is not rolled out for it.
     """
-    policies = {method: [method] for method in shown_policies(cfg)}
-    if cfg.experiment.checkpoints == "select":
-        policies |= {method: [*snapshots_of(cfg, method), method] for method in cfg.methods}
+    policies = checkpoints_of(cfg)
     runs = {method: [Run(*each) for each in product(among, decodings(cfg))] for method, among in policies.items()}
     tuned = {run for among in runs.values() if len(among) > 1 for run in among}
     stages.run("tune", evaluate_job, cfg, jobs_of(cfg, tuned, "tune"))
@@ -121,6 +128,14 @@ def measure(cfg: DictConfig, stages: Stages, chosen: Chosen) -> None:
     )
     policies = dict.fromkeys(run.policy for run in [*chosen.best.values(), *chosen.common.values()])
     stages.run("likelihood", likelihood_job, cfg, [(seed, policy, split) for policy in policies for seed in cfg.seeds])
+
+
+def checkpoints_of(cfg: DictConfig) -> dict[str, list[str]]:
+    """Policies of which one stands for each row."""
+    policies = {method: [method] for method in shown_policies(cfg)}
+    if cfg.experiment.checkpoints == "select":
+        policies |= {method: [*snapshots_of(cfg, method), method] for method in cfg.methods}
+    return policies
 
 
 def shown_policies(cfg: DictConfig) -> list[str]:

@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
 from dpa.policy import Decoding, MotionLM
 from dpa.ranking import PreferenceDistance
 from dpa.realism.config import RealismConfig
-from dpa.report.experiment import REPORTED
+from dpa.report.experiment import REPORTED, read_experiment
 from dpa.report.table import REFERENCE
 from dpa.tokens import VerletTokenizer
+from envs.options import differences
 from recipes.alignment.data import check_data
 from recipes.alignment.losses import check_fit, make_loss
 from recipes.collect import check_collection
-from recipes.common.cli import check_steps, told_of
+from recipes.common.cli import check_steps, plain, told_of
 from recipes.common.limits import GROUPS, check_limits, is_number
 from recipes.common.models import policy_config
 from recipes.common.rankings import build_distance, ranking_options
 from recipes.experiment.jobs import reference_of
 from recipes.experiment.methods import read_setups
+from recipes.experiment.runs import RunFolder
 from recipes.experiment.summary import labels
 
 CHECKPOINTS = ("last", "select", "all")
@@ -29,6 +32,8 @@ OWN = ("run/default.yaml", "comparison.yaml", "experiment/base.yaml")
 """Where the options stand that an experiment has beside its :data:`SECTIONS`."""
 SECTIONS = ("logger", "pretraining", "collection", "alignment", "evaluation")
 AXIS = ("name", "values", "log")
+TRAINED_BY = ("model", "methods", "alignment", "rankings")
+"""Options that policies which are taken over must have been trained with, beside those of their references."""
 
 
 def check_experiment(cfg: DictConfig) -> None:
@@ -48,6 +53,7 @@ def check_experiment(cfg: DictConfig) -> None:
     if not cfg.seeds or len(set(cfg.seeds)) < len(cfg.seeds):
         raise ValueError(f"seeds must be one or more, each once, got {list(cfg.seeds)}.")
     _check_references(cfg)
+    check_trained(cfg)
     _check_decodings(cfg)
     check_collection(cfg.collection)
     _check_rankings(cfg)
@@ -82,6 +88,28 @@ def _check_references(cfg: DictConfig) -> None:
     if cfg.reference is not None:
         for seed in cfg.seeds:
             reference_of(cfg, seed)
+
+
+def check_trained(cfg: DictConfig) -> None:
+    """Refuse a folder whose policies are to be taken over unless it has finished this experiment, by these options.
+
+    Raises:
+        ValueError: it has not.
+    """
+    if cfg.trained is None:
+        return
+    runs, name = RunFolder(Path(cfg.trained)), cfg.experiment.name
+    if not runs.experiment(name).is_file():
+        raise ValueError(
+            f"trained={cfg.trained} has no finished experiment {name!r}; run it there first, or say trained=null."
+        )
+    theirs = read_experiment(runs.experiment(name))
+    if untrained := [seed for seed in cfg.seeds if seed not in theirs.seeds]:
+        raise ValueError(f"trained={cfg.trained} has no seed {untrained[0]}; it has {list(theirs.seeds)}.")
+    told = (theirs.config, plain(cfg))
+    there, here = ({key: each[key] for key in TRAINED_BY} | {"setup": each["experiment"]["setup"]} for each in told)
+    if differ := differences(there, here):
+        raise ValueError(f"trained={cfg.trained} was trained with other options than are told here: {differ}.")
 
 
 def _check_decodings(cfg: DictConfig) -> None:

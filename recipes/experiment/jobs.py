@@ -58,6 +58,11 @@ def reference_of(cfg: DictConfig, seed: int) -> Path:
     return path
 
 
+def adopt_job(cfg: DictConfig, seed: int, policy: str) -> None:
+    """A reference, an aligned policy or a snapshot of the folder ``trained``."""
+    adopt(RunFolder(Path(cfg.trained)).policy(seed, policy), runs_of(cfg).policy(seed, policy))
+
+
 def adopt(policy: Path, place: Path) -> None:
     """Take over a policy as it is; a place that holds another one is refused.
 
@@ -66,9 +71,7 @@ def adopt(policy: Path, place: Path) -> None:
     """
     content = policy.read_bytes()
     if place.is_file() and place.read_bytes() != content:
-        raise ValueError(
-            f"{place} is another policy than reference={policy}; name another output, or remove {place.parent.parent}."
-        )
+        raise ValueError(f"{place} is another policy than {policy}; name another output, or remove {place.parent}.")
     place.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(place, content)
 

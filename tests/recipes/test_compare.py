@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -129,6 +130,35 @@ def test_every_experiment_runs_in_the_folder_of_the_first(
     assert found["title"] in (finished / "index.html").read_text()
     if found["split"] == "tune":
         assert all(Path(row["file"]).name.startswith("tune_") for row in found["rows"])
+
+
+def test_policies_that_are_taken_over_are_judged_as_where_they_were_trained(
+    run: Callable, options: Callable, finished: Path, tmp_path: Path
+) -> None:
+    outcome = run("compare", *command(options, tmp_path, *OTHERS, f"trained={finished}"))
+    assert outcome.status == 0, outcome.err
+    mine, theirs = experiment(tmp_path), experiment(finished)
+    assert not {"pretrain", "align"} & set(mine["stages"]), "nothing is trained"
+    for name in ("rows", "own_best", "tuning", "likelihood", "chosen", "compute", "budget"):
+        assert mine[name] == theirs[name], name
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        (["experiment=features"], "has no finished experiment 'features'; run it there first"),
+        (["seeds=[0,7]"], r"has no seed 7; it has \[0\]"),
+        (["alignment.lr=0.5"], "was trained with other options than are told here: 'alignment.lr'"),
+        (["+experiment.setup.dpa_omf={length:2}"], "'setup.dpa_omf.length': nothing there, 2 here"),
+    ],
+)
+def test_a_folder_that_has_not_trained_what_is_asked_for_is_refused(
+    run: Callable, options: Callable, finished: Path, tmp_path: Path, changed: list[str], told: str
+) -> None:
+    others = [] if changed == ["experiment=features"] else OTHERS
+    outcome = run("compare", *command(options, tmp_path, *others, f"trained={finished}", *changed))
+    assert outcome.status == 2 and re.search(told, outcome.err), outcome.err
+    assert not (tmp_path / "seed_0").exists()
 
 
 @pytest.mark.slow
