@@ -15,6 +15,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Sequence
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import hydra
@@ -25,7 +26,7 @@ from dpa.report.experiment import read_experiment, read_json
 from dpa.report.table import REFERENCE, print_table
 from envs.files import write_json
 from recipes.common.cli import CONFIG, recipe
-from recipes.common.provenance import provenance
+from recipes.common.provenance import merged, provenance
 from recipes.common.scenes import open_splits
 from recipes.experiment.cards import write_scene_cards
 from recipes.experiment.check import check_experiment
@@ -40,10 +41,10 @@ from recipes.experiment.jobs import (
     runs_of,
 )
 from recipes.experiment.logged import log_experiment
-from recipes.experiment.methods import levels, read_setups, setup_of
+from recipes.experiment.methods import checkpoints_of, levels, policies_of, read_setups
 from recipes.experiment.pictures import write_players
 from recipes.experiment.pool import Workers
-from recipes.experiment.runs import SNAPSHOT, Run
+from recipes.experiment.runs import Run, RunFolder
 from recipes.experiment.stages import Stages, alone_in
 from recipes.experiment.summary import Chosen, summarise_experiment
 from recipes.report import report
@@ -64,7 +65,7 @@ def compare(cfg: DictConfig) -> dict[str, Any]:
             (train_policies if cfg.trained is None else adopt_policies)(cfg, stages)
             chosen = choose(cfg, stages)
             measure(cfg, stages, chosen)
-        found = summarise_experiment(cfg, splits, chosen, stages) | stages.made | {"command": made["command"]}
+        found = summarise_experiment(cfg, splits, chosen, stages) | made_by(cfg, stages) | {"command": made["command"]}
         path, pictures = runs.experiment(cfg.experiment.name), {}
         write_json(path, found)
         if cfg.pictures.scenes:
@@ -73,10 +74,17 @@ def compare(cfg: DictConfig) -> dict[str, Any]:
     return found
 
 
+def made_by(cfg: DictConfig, stages: Stages) -> dict[str, Any]:
+    """Code, machine and date of all that the result rests on, trainings elsewhere too."""
+    if cfg.trained is None:
+        return stages.made
+    theirs = read_json(RunFolder(Path(cfg.trained)).experiment(cfg.experiment.name))
+    return merged([{name: each[name] for name in stages.made} for each in (theirs, stages.made)])
+
+
 def adopt_policies(cfg: DictConfig, stages: Stages) -> None:
     """References and aligned policies of another folder, and ranked rollouts of the reported scenes."""
-    policies = dict.fromkeys([*shown_policies(cfg), *(each for one in checkpoints_of(cfg).values() for each in one)])
-    stages.run("adopt", adopt_job, cfg, [(seed, policy) for policy in policies for seed in cfg.seeds])
+    stages.run("adopt", adopt_job, cfg, [(seed, policy) for policy in policies_of(cfg) for seed in cfg.seeds])
     stages.run("collect", collect_job, cfg, [(seed, cfg.experiment.split, REFERENCE) for seed in cfg.seeds])
 
 
@@ -128,28 +136,6 @@ def measure(cfg: DictConfig, stages: Stages, chosen: Chosen) -> None:
     )
     policies = dict.fromkeys(run.policy for run in [*chosen.best.values(), *chosen.common.values()])
     stages.run("likelihood", likelihood_job, cfg, [(seed, policy, split) for policy in policies for seed in cfg.seeds])
-
-
-def checkpoints_of(cfg: DictConfig) -> dict[str, list[str]]:
-    """Policies of which one stands for each row."""
-    policies = {method: [method] for method in shown_policies(cfg)}
-    if cfg.experiment.checkpoints == "select":
-        policies |= {method: [*snapshots_of(cfg, method), method] for method in cfg.methods}
-    return policies
-
-
-def shown_policies(cfg: DictConfig) -> list[str]:
-    """What has a row of its own: the reference, every method, and its snapshots where all are shown."""
-    shown = [REFERENCE]
-    for method in cfg.methods:
-        shown += [*(snapshots_of(cfg, method) if cfg.experiment.checkpoints == "all" else []), method]
-    return shown
-
-
-def snapshots_of(cfg: DictConfig, method: str) -> list[str]:
-    """Names of the snapshots of a method."""
-    options = setup_of(cfg, method).merged(cfg.alignment)
-    return [f"{method}{SNAPSHOT}{step}" for step in options.snapshots if step < options.steps]
 
 
 def decodings(cfg: DictConfig) -> list[Decoding]:

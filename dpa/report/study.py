@@ -16,7 +16,7 @@ from dpa.report.scenes import SceneCard, read_scene_cards
 STUDIES = ("validity", "sensitivity", "discriminator")
 """Folders of a study that a recipe of their own fills."""
 FIRST = "methods"
-"""Experiment that stands first where there is one, so that the headline is of it."""
+"""Experiment that stands first where there is one, so that the headline is of it; those of tuning scenes stand last."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Study:
 
     Attributes:
         folder: of the study.
-        experiments: by name, :data:`FIRST` before the others.
+        experiments: by name, :data:`FIRST` before the others, and those of tuning scenes after them.
         stages: seconds of each job of each stage.
         players: packed scenes and rollouts, see :func:`dpa.report.player.pack_players`.
         summaries: ``summary.json`` of each of :data:`STUDIES`.
@@ -65,10 +65,11 @@ def read_study(folder: str | Path) -> Study:
     folder = Path(folder)
     if not folder.is_dir():
         raise ValueError(f"{folder} is no folder; name the one that recipes.compare wrote (its output=...).")
-    paths = sorted((folder / "experiments").glob("*.json"), key=lambda path: (path.stem != FIRST, path.stem))
+    experiments = [read_experiment(path) for path in (folder / "experiments").glob("*.json")]
+    experiments.sort(key=lambda each: (each.name != FIRST, each.split != "eval", each.name))
     summaries = {name: folder / name / "summary.json" for name in STUDIES}
     summaries = {name: read_json(path) for name, path in summaries.items() if path.is_file()}
-    if not paths and not summaries:
+    if not experiments and not summaries:
         raise ValueError(
             f"{folder} holds no results: neither experiments/*.json nor {', '.join(STUDIES)} with a summary.json; run "
             f"python -m recipes.compare experiment={FIRST} output={folder} first."
@@ -76,7 +77,7 @@ def read_study(folder: str | Path) -> Study:
     stages, players, scenes = (folder / f"{name}.json" for name in ("stages", "players", "scenes"))
     return Study(
         folder=folder,
-        experiments={path.stem: read_experiment(path) for path in paths},
+        experiments={each.path.stem: each for each in experiments},
         stages=_account(stages) if stages.is_file() else {},
         players=read_json(players) if players.is_file() else None,
         summaries=summaries,

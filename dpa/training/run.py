@@ -30,8 +30,10 @@ def seconds_trained(folder: Path) -> float:
 
 def _refuse_other_options(folder: Path, config: Mapping[str, Any]) -> None:
     """A run that was killed before its first checkpoint is a run too: its folder is not for other options."""
-    written = folder / "config.json"
+    written, policy = folder / "config.json", folder / "policy.pt"
     if not written.is_file():
+        if policy.is_file():
+            raise ValueError(f"{policy} was not trained there; name another output folder, or remove it.")
         return
     try:
         there = dict(json.loads(written.read_text(encoding="utf-8")))

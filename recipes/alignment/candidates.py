@@ -25,6 +25,7 @@ from dpa.preferences import (
     separated,
     thin_out,
 )
+from dpa.rewards import SMALLEST_SPREAD
 from dpa.tokens import MotionTokenizer
 from dpa.training.logs import log_item
 from envs import keys
@@ -199,13 +200,15 @@ def ranked_by(ranked: TensorDict, name: str) -> tuple[Tensor, Tensor | None]:
         name: ``distance``, ``ade`` or a reward that is paid by agent.
 
     Returns:
-        ``[K]`` and ``[K, A]``; None by displacement, which is kept of rollouts as a whole.
+        ``[K]`` and ``[K, A]``; None by displacement, which is kept of rollouts as a whole. Of an agent that is paid
+        alike in all rollouts, but for rounding, 0: it has no preference.
     """
     if name == keys.DISTANCE:
         return ranked[keys.DISTANCE], ranked[keys.AGENT_DISTANCE]
     if name == keys.ADE:
         return ranked[keys.ADE], None
-    of_agents = -ranked[keys.REWARDS, name][..., 0]
+    paid = ranked[keys.REWARDS, name][..., 0]
+    of_agents = torch.where(paid.std(0) > SMALLEST_SPREAD * paid.abs().amax(0), -paid, 0)
     return of_agents.sum(-1), of_agents
 
 

@@ -106,6 +106,13 @@ def check_data(data: DictConfig, held: int) -> DictConfig:
     return counted
 
 
+def rewards_of(data: DictConfig) -> dict[str, float]:
+    """Weights of the rewards that a method follows or ranks by; none of most methods."""
+    if data.kind == "own_pairs":
+        return {} if data.rank_by in KEPT else {data.rank_by: 1.0}
+    return {name: weight for name, weight in data.get("rewards", {}).items() if weight}
+
+
 def check_rolling(data: DictConfig) -> tuple[Decoding, Distance]:
     """How a method draws rollouts of its own, and what ranks them.
 

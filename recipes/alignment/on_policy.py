@@ -27,7 +27,7 @@ from envs import keys
 from envs.scene import SceneSource
 from envs.seeding import make_generator
 from recipes.alignment.candidates import Chosen, Group, group_of, pair_up, ranked_by
-from recipes.alignment.data import KEPT, check_data, check_rolling
+from recipes.alignment.data import check_data, check_rolling, rewards_of
 from recipes.alignment.draws import Draw, make_batch
 from recipes.common.cli import build
 
@@ -100,7 +100,7 @@ class OnPolicyStep:
     ) -> None:
         self.data, self.options, self.seed = check_data(data, 0), options, seed
         self.loss, self.contexts, self.device, self.ranks = loss, Contexts(scenes, context), device, ranks
-        self.passes, self.rewards = data.get("passes", 1), _weighing(data)
+        self.passes, self.rewards = data.get("passes", 1), rewards_of(data)
         self.optimizer = make_optimizer(model, options.lr, options.weight_decay)
         self.schedule = make_schedule(self.optimizer, self.passes * options.steps, self.passes * options.warmup)
         self.order = ShuffledOrder(len(scenes), options.scenes_per_step, seed)
@@ -239,13 +239,6 @@ class OnPolicyStep:
         value, of_agents = ranked_by(one.ranked, self.data.rank_by)
         near, far = pair_up(self.data, value[None], draw)
         return group_of(one.context, one.ranked, Chosen(near[0], far[0]), self.data.kind, of_agents)
-
-
-def _weighing(data: DictConfig) -> dict[str, float]:
-    """Weights of the rewards that a method follows or ranks by, if it does any."""
-    if data.kind == "own_pairs":
-        return {} if data.rank_by in KEPT else {data.rank_by: 1.0}
-    return {name: weight for name, weight in data.rewards.items() if weight}
 
 
 def tasks_of(step: int, sizes: dict[int, int], num_rollouts: int, most: int, workers: int = 1) -> list[RolloutTask]:

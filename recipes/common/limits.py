@@ -67,7 +67,7 @@ LIMITS: dict[str, Limit] = {
     **dict.fromkeys(("rankings", "rewards", "bins", "tokenizer", "setup", "labels", "published"), Limit(dict)),
     **dict.fromkeys(BINS, POSITIVE._replace(many=True)),
     "grid": Limit(float, many=True),
-    "start": Limit(str, empty=True),
+    **dict.fromkeys(("start", "trained"), Limit(str, empty=True)),
     "optimizer": Limit(str, among=OPTIMIZERS),
     "schedule": Limit(str, among=SCHEDULES),
     "precision": Limit(str, among=PRECISIONS),

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -12,9 +14,10 @@ from dpa.ranking import PreferenceDistance
 from dpa.realism.config import RealismConfig
 from dpa.report.experiment import REPORTED, read_experiment
 from dpa.report.table import REFERENCE
+from dpa.rewards import check_horizon
 from dpa.tokens import VerletTokenizer
 from envs.options import differences
-from recipes.alignment.data import check_data
+from recipes.alignment.data import check_data, rewards_of
 from recipes.alignment.losses import check_fit, make_loss
 from recipes.collect import check_collection
 from recipes.common.cli import check_steps, plain, told_of
@@ -22,7 +25,7 @@ from recipes.common.limits import GROUPS, check_limits, is_number
 from recipes.common.models import policy_config
 from recipes.common.rankings import build_distance, ranking_options
 from recipes.experiment.jobs import reference_of
-from recipes.experiment.methods import read_setups
+from recipes.experiment.methods import policies_of, read_setups
 from recipes.experiment.runs import RunFolder
 from recipes.experiment.summary import labels
 
@@ -32,8 +35,8 @@ OWN = ("run/default.yaml", "comparison.yaml", "experiment/base.yaml")
 """Where the options stand that an experiment has beside its :data:`SECTIONS`."""
 SECTIONS = ("logger", "pretraining", "collection", "alignment", "evaluation")
 AXIS = ("name", "values", "log")
-TRAINED_BY = ("model", "methods", "alignment", "rankings")
-"""Options that policies which are taken over must have been trained with, beside those of their references."""
+OF_THE_MACHINE = ("workers", "memory", "max_rows", "checkpoint_interval")
+"""Options of an alignment that change no policy, but for rounding."""
 
 
 def check_experiment(cfg: DictConfig) -> None:
@@ -52,8 +55,7 @@ def check_experiment(cfg: DictConfig) -> None:
     RealismConfig.load(str(cfg.evaluation.metric))
     if not cfg.seeds or len(set(cfg.seeds)) < len(cfg.seeds):
         raise ValueError(f"seeds must be one or more, each once, got {list(cfg.seeds)}.")
-    _check_references(cfg)
-    check_trained(cfg)
+    _check_references(cfg) if cfg.trained is None else check_trained(cfg)
     _check_decodings(cfg)
     check_collection(cfg.collection)
     _check_rankings(cfg)
@@ -94,22 +96,37 @@ def check_trained(cfg: DictConfig) -> None:
     """Refuse a folder whose policies are to be taken over unless it has finished this experiment, by these options.
 
     Raises:
-        ValueError: it has not.
+        ValueError: it has not, it lacks a policy, or it is this very folder.
     """
     if cfg.trained is None:
         return
     runs, name = RunFolder(Path(cfg.trained)), cfg.experiment.name
+    if runs.root.resolve() == Path(cfg.output).resolve():
+        raise ValueError(f"trained={cfg.trained} is the output as well; name another output.")
     if not runs.experiment(name).is_file():
         raise ValueError(
             f"trained={cfg.trained} has no finished experiment {name!r}; run it there first, or say trained=null."
         )
-    theirs = read_experiment(runs.experiment(name))
-    if untrained := [seed for seed in cfg.seeds if seed not in theirs.seeds]:
-        raise ValueError(f"trained={cfg.trained} has no seed {untrained[0]}; it has {list(theirs.seeds)}.")
-    told = (theirs.config, plain(cfg))
-    there, here = ({key: each[key] for key in TRAINED_BY} | {"setup": each["experiment"]["setup"]} for each in told)
-    if differ := differences(there, here):
+    theirs, mine = read_experiment(runs.experiment(name)).config, plain(cfg)
+    if origin := theirs.get("trained"):
+        raise ValueError(f"trained={cfg.trained} has its policies from {origin}; say trained={origin}.")
+    if differ := differences(_of_training(theirs, mine["methods"]), _of_training(mine, mine["methods"])):
         raise ValueError(f"trained={cfg.trained} was trained with other options than are told here: {differ}.")
+    missing = [
+        path for seed in cfg.seeds for each in policies_of(cfg) if not (path := runs.policy(seed, each)).is_file()
+    ]
+    if missing:
+        raise ValueError(f"{missing[0]} does not exist; finish the experiment there, or leave its seed or method out.")
+
+
+def _of_training(config: Mapping[str, Any], methods: Iterable[str]) -> dict[str, Any]:
+    """What decides the aligned policies of some methods, beside their references and scenes."""
+    given = {name: config[name] for name in ("model", "rankings", "aligned_scenes")}
+    given["alignment"] = {key: value for key, value in config["alignment"].items() if key not in OF_THE_MACHINE}
+    given["collection"] = {key: config["collection"][key] for key in ("num_rollouts", "decoding", "ranking")}
+    given["methods"] = {name: config["methods"].get(name) for name in methods}
+    given["setup"] = {name: config["experiment"]["setup"].get(name) for name in methods}
+    return given
 
 
 def _check_decodings(cfg: DictConfig) -> None:
@@ -161,7 +178,8 @@ def _check_methods(cfg: DictConfig) -> None:
                 )
         with told_of(f"methods.{name}"):
             check_fit(cfg.methods[name], alignment, cfg.collection.num_rollouts)
-            check_data(cfg.methods[name].data, cfg.collection.num_rollouts)
+            data = check_data(cfg.methods[name].data, cfg.collection.num_rollouts)
+            check_horizon(rewards_of(data), cfg.model.context.decision_steps * cfg.model.context.horizon)
             make_loss(cfg.methods[name].loss, model)
             check_steps(alignment, "alignment")
 

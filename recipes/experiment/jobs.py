@@ -71,7 +71,9 @@ def adopt(policy: Path, place: Path) -> None:
     """
     content = policy.read_bytes()
     if place.is_file() and place.read_bytes() != content:
-        raise ValueError(f"{place} is another policy than {policy}; name another output, or remove {place.parent}.")
+        raise ValueError(
+            f"{place} is another policy than {policy}; name another output, or remove {place.parent.parent}."
+        )
     place.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(place, content)
 

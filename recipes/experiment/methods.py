@@ -147,3 +147,30 @@ def levels(setups: Mapping[str, Setup]) -> list[list[str]]:
         done |= set(ready)
         left = {name: setup for name, setup in left.items() if name not in ready}
     return found
+
+
+def checkpoints_of(cfg: DictConfig) -> dict[str, list[str]]:
+    """Policies of which one stands for each row."""
+    policies = {method: [method] for method in shown_policies(cfg)}
+    if cfg.experiment.checkpoints == "select":
+        policies |= {method: [*snapshots_of(cfg, method), method] for method in cfg.methods}
+    return policies
+
+
+def shown_policies(cfg: DictConfig) -> list[str]:
+    """What has a row of its own: the reference, every method, and its snapshots where all are shown."""
+    shown = [REFERENCE]
+    for method in cfg.methods:
+        shown += [*(snapshots_of(cfg, method) if cfg.experiment.checkpoints == "all" else []), method]
+    return shown
+
+
+def snapshots_of(cfg: DictConfig, method: str) -> list[str]:
+    """Names of the snapshots of a method."""
+    options = setup_of(cfg, method).merged(cfg.alignment)
+    return [f"{method}{SNAPSHOT}{step}" for step in options.snapshots if step < options.steps]
+
+
+def policies_of(cfg: DictConfig) -> list[str]:
+    """All that a comparison may roll out, the reference first."""
+    return list(dict.fromkeys(policy for among in checkpoints_of(cfg).values() for policy in among))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -143,13 +144,34 @@ def test_policies_that_are_taken_over_are_judged_as_where_they_were_trained(
         assert mine[name] == theirs[name], name
 
 
+def test_a_folder_is_taken_over_whole_once_and_not_trained_on(
+    run: Callable, options: Callable, finished: Path, tmp_path: Path
+) -> None:
+    taken, more = tmp_path / "taken", [*OTHERS, "~methods.adversarial_afd"]
+    assert run("compare", *command(options, taken, *more, f"trained={finished}")).status == 0
+    told = run("compare", *command(options, tmp_path / "again", *more, f"trained={taken}"))
+    assert told.status == 2 and f"has its policies from {finished}; say trained={finished}" in told.err
+    told = run("compare", *command(options, taken, *more))
+    assert told.status == 2 and "was not trained there; name another output folder" in told.err
+    told = run("compare", *command(options, finished, *OTHERS, f"trained={finished}"))
+    assert told.status == 2 and "is the output as well" in told.err
+    folder = tmp_path / "thinned"
+    shutil.copytree(finished, folder)
+    (folder / "seed_0/dpa_omf/step_2/policy.pt").unlink()
+    told = run("compare", *command(options, tmp_path / "again", *OTHERS, f"trained={folder}"))
+    assert told.status == 2 and "step_2/policy.pt does not exist" in told.err
+    assert not (tmp_path / "again").exists()
+
+
 @pytest.mark.parametrize(
     ("changed", "told"),
     [
         (["experiment=features"], "has no finished experiment 'features'; run it there first"),
-        (["seeds=[0,7]"], r"has no seed 7; it has \[0\]"),
+        (["seeds=[0,7]"], "seed_7/reference/policy.pt does not exist; finish the experiment there"),
         (["alignment.lr=0.5"], "was trained with other options than are told here: 'alignment.lr'"),
-        (["+experiment.setup.dpa_omf={length:2}"], "'setup.dpa_omf.length': nothing there, 2 here"),
+        (["collection.num_rollouts=6"], "'collection.num_rollouts': 4 there, 6 here"),
+        (["alignment.snapshots=[3]"], r"'alignment.snapshots': \[2\] there, \[3\] here"),
+        (["+experiment.setup.dpa_omf={length:2}"], "'setup.dpa_omf': None there"),
     ],
 )
 def test_a_folder_that_has_not_trained_what_is_asked_for_is_refused(

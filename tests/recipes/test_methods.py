@@ -15,11 +15,11 @@ from omegaconf import DictConfig
 from dpa.policy import Decoding
 from envs.files import write_json
 from recipes.common.cli import CONFIG
-from recipes.compare import choose, snapshots_of
+from recipes.compare import choose
 from recipes.experiment import jobs
 from recipes.experiment.check import check_experiment
 from recipes.experiment.jobs import runs_of
-from recipes.experiment.methods import drawing_seed, read_setups, setup_of
+from recipes.experiment.methods import drawing_seed, read_setups, setup_of, snapshots_of
 from recipes.experiment.pool import Workers
 from recipes.experiment.runs import Run
 from recipes.experiment.stages import Stages, alone_in, read_account
