@@ -25,24 +25,20 @@ YEAR = "2024"
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """K rollouts of one scene, as a reward sees them; A agents are present.
+class Judged:
+    """K rollouts of one scene, as the realism metric and measures of safety see them; A agents are present.
 
     Attributes:
         scene: uncollated.
         trajectories: ``[K, A, T * F, 4]`` x, y, z, heading at 10 Hz after the current step.
         controlled: ``[A]`` bool, agents that the policy moved.
-        ranking: of the rollouts.
-        distance: that ranked them.
-        decisions: T.
+        metric: year of the realism metric.
     """
 
     scene: Scene
     trajectories: Tensor
     controlled: Tensor
-    ranking: Ranking
-    distance: Distance
-    decisions: int
+    metric: str = YEAR
 
     @cached_property
     def motion(self) -> Motion:
@@ -61,8 +57,14 @@ class Outcome:
 
     @cached_property
     def measured(self) -> Features:
-        """What the realism metric of :data:`YEAR` measures of the controlled agents, in ascending order of track id."""
-        return measure([compare(self.judged, self.trajectories, judge())], judge())[0]
+        """What the realism metric measures of the controlled agents, in ascending order of track id."""
+        config = judge(self.metric)
+        return measure([compare(self.judged, self.trajectories, config)], config)[0]
+
+    @property
+    def added(self) -> Tensor:
+        """``[K, A]``: what each agent of a rollout adds to the realism of the group."""
+        return self.by_agent(contributions(self.measured, judge(self.metric)))
 
     def by_agent(self, value: Tensor) -> Tensor:
         """``[K, E]`` of :attr:`measured` agents as ``[K, A]``, 0 of all others."""
@@ -71,14 +73,29 @@ class Outcome:
         return value.new_zeros(self.trajectories.shape[:2]).index_copy_(1, rows, value)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Outcome(Judged):
+    """K rollouts of one scene, as a reward sees them.
+
+    Attributes:
+        ranking: of the rollouts.
+        distance: that ranked them.
+        decisions: T.
+    """
+
+    ranking: Ranking
+    distance: Distance
+    decisions: int
+
+
 Reward = Callable[[Outcome], Tensor]
 """What follows each decision: ``[K, A, T]``, with one of A or T where all agents or decisions are paid alike."""
 
 
 @cache
-def judge() -> RealismConfig:
-    """The metric behind the rewards of realism and of its events."""
-    return RealismConfig.load(YEAR)
+def judge(metric: str) -> RealismConfig:
+    """The metric of a year, which is behind the rewards of realism and of its events."""
+    return RealismConfig.load(metric)
 
 
 def _distance(outcome: Outcome) -> Tensor:
@@ -98,7 +115,7 @@ def _ade(outcome: Outcome) -> Tensor:
 
 def _realism(outcome: Outcome) -> Tensor:
     """What each agent of a rollout adds to the realism of its group."""
-    return outcome.by_agent(contributions(outcome.measured, judge()))[..., None]
+    return outcome.added[..., None]
 
 
 def _step_distance(outcome: Outcome) -> Tensor:

@@ -25,7 +25,6 @@ from dpa.preferences import (
     separated,
     thin_out,
 )
-from dpa.rewards import SMALLEST_SPREAD
 from dpa.tokens import MotionTokenizer
 from dpa.training.logs import log_item
 from envs import keys
@@ -150,13 +149,11 @@ class Candidates(Sequence[Group]):
         scene = int(self.store.scenes[row])
         context = self.contexts[scene]
         agents = len(context.kind)
-        ranked, kind = self.store.read([row], num_agents=agents)[0], self.data.kind
-        of_agents = ranked_by(ranked, self.data.rank_by)[1] if kind in PAIRED else None
-        group = group_of(context, ranked, self.chosen[row], kind, of_agents)
-        if kind == "adversarial":
+        group = group_of(self.data, context, self.store.read([row], num_agents=agents)[0], self.chosen[row])
+        if self.data.kind == "adversarial":
             log = log_item(context, self.tokenizer)
             return _against(group, log.tokens.expand(self.data.num, -1, -1), log.token_valid)
-        if kind == "expert":
+        if self.data.kind == "expert":
             played = self.expert.read([_row_of(self.expert, scene)], num_agents=agents)[0]
             draw = make_generator(self.seed, "expert_rollouts", scene)
             drawn = random_rollouts(1, len(played[keys.TOKENS]), self.data.num, draw)[0]
@@ -173,43 +170,14 @@ class Candidates(Sequence[Group]):
         return {len(each.preferred) for each in self.chosen.values()}
 
 
-def group_of(
-    context: SceneContext, ranked: TensorDict, chosen: Chosen, kind: str, of_agents: Tensor | None = None
-) -> Group:
-    """Chosen rollouts of one scene's own ranked group, which is cut to its own agents.
-
-    Args:
-        context: uncollated.
-        ranked: of batch size ``[]``.
-        chosen: rollouts of both sides.
-        kind: one of :data:`~recipes.alignment.data.SIDES`.
-        of_agents: ``[K, A]``, by which agents have a preference of their own in pairs, the lower the better.
-    """
+def group_of(data: DictConfig, context: SceneContext, ranked: TensorDict, chosen: Chosen) -> Group:
+    """Chosen rollouts of one scene's own ranked group, which is cut to its own agents."""
     tokens, valid, say = ranked[keys.TOKENS], ranked[keys.TOKEN_VALID], None
-    if of_agents is not None:
-        say = agent_preference(of_agents[None], *(side[None] for side in chosen))[0]
-    unpreferred = None if kind == "best" else tokens[chosen.unpreferred]
-    return Group(context, tokens[chosen.preferred], unpreferred, valid, say, SIDES[kind])
-
-
-def ranked_by(ranked: TensorDict, name: str) -> tuple[Tensor, Tensor | None]:
-    """What ranks the rollouts of a group, and each agent's in them, the lower the better.
-
-    Args:
-        ranked: of batch size ``[]``; with ``REWARDS`` if it is to be ranked by one.
-        name: ``distance``, ``ade`` or a reward that is paid by agent.
-
-    Returns:
-        ``[K]`` and ``[K, A]``; None by displacement, which is kept of rollouts as a whole. Of an agent that is paid
-        alike in all rollouts, but for rounding, 0: it has no preference.
-    """
-    if name == keys.DISTANCE:
-        return ranked[keys.DISTANCE], ranked[keys.AGENT_DISTANCE]
-    if name == keys.ADE:
-        return ranked[keys.ADE], None
-    paid = ranked[keys.REWARDS, name][..., 0]
-    of_agents = torch.where(paid.std(0) > SMALLEST_SPREAD * paid.abs().amax(0), -paid, 0)
-    return of_agents.sum(-1), of_agents
+    # Displacement is kept of rollouts as a whole: agents have a preference by the distance only.
+    if data.kind in PAIRED and data.rank_by == keys.DISTANCE:
+        say = agent_preference(ranked[keys.AGENT_DISTANCE][None], *(side[None] for side in chosen))[0]
+    unpreferred = None if data.kind == "best" else tokens[chosen.unpreferred]
+    return Group(context, tokens[chosen.preferred], unpreferred, valid, say, SIDES[data.kind])
 
 
 def _against(group: Group, preferred: Tensor, token_valid: Tensor) -> Group:

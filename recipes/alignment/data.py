@@ -34,11 +34,6 @@ ON_POLICY = ("closed_loop", *ROLLED)
 """Those of them that roll the policy out themselves, in every step, and need no rollouts from before."""
 RANKED = ("pairs", "best", "sets", "ranking", "own_pairs")
 """Those of them that read ranks."""
-KEPT = (keys.DISTANCE, keys.ADE)
-"""What rollouts that are kept are ranked by."""
-RANKS = dict.fromkeys(RANKED, KEPT) | {"own_pairs": (*KEPT, "realism")}
-"""What each may rank by. Pairs of one's own may be ranked by the reward of realism as well; those of events, which most
-rollouts have alike, would rank by chance."""
 PAIRED = ("pairs", "own_pairs")
 """Those of them that pair rollouts by rank."""
 READ = {
@@ -107,9 +102,7 @@ def check_data(data: DictConfig, held: int) -> DictConfig:
 
 
 def rewards_of(data: DictConfig) -> dict[str, float]:
-    """Weights of the rewards that a method follows or ranks by; none of most methods."""
-    if data.kind == "own_pairs":
-        return {} if data.rank_by in KEPT else {data.rank_by: 1.0}
+    """Weights of the rewards that a method follows; none of most methods."""
     return {name: weight for name, weight in data.get("rewards", {}).items() if weight}
 
 
@@ -165,8 +158,8 @@ def _check(data: DictConfig, held: int, given: DictConfig) -> None:
         if not is_number(data.get("recovery")) or not 0 < data.recovery <= 1:
             raise ValueError(f"method.data.recovery must lie in (0, 1], got {data.get('recovery')!r}.")
         return None
-    if data.kind in RANKED and data.rank_by not in RANKS[data.kind]:
-        raise ValueError(f"method.data.rank_by must be {' or '.join(RANKS[data.kind])}, got {data.rank_by!r}.")
+    if data.kind in RANKED and data.rank_by not in (keys.DISTANCE, keys.ADE):
+        raise ValueError(f"method.data.rank_by must be distance or ade, got {data.rank_by!r}.")
     if data.kind in PAIRED and data.pairs not in PAIRS:
         raise ValueError(f"method.data.pairs must be one of {', '.join(PAIRS)}, got {data.pairs!r}.")
     if data.kind in PAIRED and data.pairs == "all":

@@ -57,10 +57,10 @@ def check_fit(method: DictConfig, alignment: DictConfig, held: int) -> None:
         ValueError: for instance a ranking loss for pairs, or for rankings of two.
     """
     data = method.data
-    if method.loss.get("credit") == "agent" and not (data.kind in PAIRED and data.rank_by != keys.ADE):
+    if method.loss.get("credit") == "agent" and not (data.kind in PAIRED and data.rank_by == keys.DISTANCE):
         raise ValueError(
             "method.loss.credit=agent needs pairs that agents are ranked in one by one: method.data.kind=pairs or "
-            f"own_pairs, and another rank_by than {keys.ADE}, got {data.kind} and {data.get('rank_by')}."
+            f"own_pairs, and rank_by={keys.DISTANCE}, got {data.kind} and {data.get('rank_by')}."
         )
     if method.loss.kind == "plackett_luce" and data.kind == "ranking":
         ranked = sum(num_drawn(*num_candidates(data, held), alignment.pairs_per_scene))

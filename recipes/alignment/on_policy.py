@@ -26,7 +26,7 @@ from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimiz
 from envs import keys
 from envs.scene import SceneSource
 from envs.seeding import make_generator
-from recipes.alignment.candidates import Chosen, Group, group_of, pair_up, ranked_by
+from recipes.alignment.candidates import Chosen, Group, group_of, pair_up
 from recipes.alignment.data import check_data, check_rolling, rewards_of
 from recipes.alignment.draws import Draw, make_batch
 from recipes.common.cli import build
@@ -236,9 +236,8 @@ class OnPolicyStep:
     def _paired(self, one: Rolled, step: int) -> Group:
         """Pairs of one scene's rollouts, as many as of any other."""
         draw = make_generator(self.seed, "random_pairs", step, one.scene)
-        value, of_agents = ranked_by(one.ranked, self.data.rank_by)
-        near, far = pair_up(self.data, value[None], draw)
-        return group_of(one.context, one.ranked, Chosen(near[0], far[0]), self.data.kind, of_agents)
+        near, far = pair_up(self.data, one.ranked[self.data.rank_by][None], draw)
+        return group_of(self.data, one.context, one.ranked, Chosen(near[0], far[0]))
 
 
 def tasks_of(step: int, sizes: dict[int, int], num_rollouts: int, most: int, workers: int = 1) -> list[RolloutTask]:

@@ -13,13 +13,18 @@ from dpa.policy import MotionLM
 from dpa.preferences import PreferenceStore
 from dpa.ranking import Distance, PreferenceDistance, Ranking
 from dpa.ranking.rival import DisplacementDistance
+from dpa.rewards import RealismRanking
 from envs.scene import Scene
 from envs.store import SceneStore
 from recipes.common.cli import build
 from recipes.common.models import weights_digest
 from recipes.common.scenes import fingerprint
 
-DISTANCES: dict[str, type[Distance]] = {"preference": PreferenceDistance, "displacement": DisplacementDistance}
+DISTANCES: dict[str, type[Distance]] = {
+    "preference": PreferenceDistance,
+    "displacement": DisplacementDistance,
+    "realism": RealismRanking,
+}
 """Distances that a YAML of ``config/ranking`` can name; add a class of your own here (docs/how-to.md)."""
 
 

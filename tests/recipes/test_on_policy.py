@@ -7,12 +7,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from tensordict import TensorDict
 
 from dpa.training.checkpoint import load_policy
 from dpa.training.loggers import read_curve
-from envs import keys
-from recipes.alignment.candidates import ranked_by
 from recipes.alignment.on_policy import tasks_of
 
 METHODS = ("rloo", "grpo", "dpa_omf_on_policy")
@@ -86,7 +83,7 @@ def test_rows_of_a_pass_change_rounding_alone(
     assert_same(tmp_path / "one", tmp_path / "all", atol=1e-5)
 
 
-@pytest.mark.parametrize("pairs", [["pairs=random"], ["pairs=all", "num=null"], ["rank_by=ade"], ["rank_by=realism"]])
+@pytest.mark.parametrize("pairs", [["pairs=random"], ["pairs=all", "num=null"], ["rank_by=ade"]])
 def test_pairs_of_its_own_may_be_any(
     run: Callable, options: Callable, origin: Path, tmp_path: Path, pairs: list[str]
 ) -> None:
@@ -96,13 +93,14 @@ def test_pairs_of_its_own_may_be_any(
     assert len(read_curve(tmp_path, "train/loss_preference")) == 2
 
 
-def test_pairs_may_be_ranked_by_what_rollouts_add_to_realism() -> None:
-    paid = torch.tensor([[0.3, 0.1, 0.2], [0.0, 0.5, 0.2000001], [0.1, 0.1, 0.2]])  # three rollouts, three agents
-    ranked = TensorDict({keys.REWARDS: {"realism": paid[..., None].expand(-1, -1, 4)}})
-    value, of_agents = ranked_by(ranked, "realism")
-    assert value.argsort().tolist() == [1, 0, 2]
-    assert of_agents.argmin(0).tolist()[:2] == [0, 1]
-    assert not of_agents[:, 2].any(), "rounding is no preference"
+@pytest.mark.parametrize("ranking", ["realism", "displacement"])
+def test_pairs_of_its_own_may_be_ranked_by_another_distance(
+    run: Callable, options: Callable, origin: Path, tmp_path: Path, ranking: str
+) -> None:
+    more = ("alignment.steps=2", f"ranking@method.data.ranking={ranking}", "method.loss.credit=agent")
+    outcome = run("align", *aligning(options, origin, "dpa_omf_on_policy", tmp_path, *more))
+    assert outcome.status == 0, outcome.err
+    assert max(value for _, value in read_curve(tmp_path, "train/gradient_norm")) > 0
 
 
 @pytest.mark.slow

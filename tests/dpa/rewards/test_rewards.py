@@ -16,7 +16,7 @@ from torchrl.envs import TransformedEnv
 from dpa.policy import MotionLM
 from dpa.ranking import DisplacementDistance, PreferenceDistance, log_trajectory
 from dpa.realism import realism, realism_of_groups
-from dpa.rewards import REWARDS, Outcome, RewardRollouts, check_horizon, check_rewards
+from dpa.rewards import REWARDS, Outcome, RealismRanking, RewardRollouts, check_horizon, check_rewards
 from dpa.rollout.job import RolloutJob, RolloutWorker
 from dpa.rollout.plan import RolloutTask
 from dpa.tokens import TokenAction, VerletTokenizer
@@ -31,7 +31,7 @@ def outcome_of(
     distance = PreferenceDistance(stride=stride)
     controlled = torch.ones(trajectories.shape[1], dtype=torch.bool) if controlled is None else controlled
     ranking = distance(scene, trajectories, controlled)
-    return Outcome(scene, trajectories, controlled, ranking, distance, decisions)
+    return Outcome(scene, trajectories, controlled, ranking=ranking, distance=distance, decisions=decisions)
 
 
 def lagging(scene: Scene, *metres: float, agent: int = 0) -> Tensor:
@@ -223,3 +223,32 @@ def test_a_reward_of_another_shape_is_refused() -> None:
 
 if __name__ == "__main__":
     pytest.main([__file__])
+
+
+def test_a_ranking_by_realism_puts_first_what_the_reward_pays_most() -> None:
+    scene = straight_road(3)
+    rollouts = lagging(scene, 0.0, 4.0, 9.0, 1.0)
+    paid = REWARDS["realism"](outcome_of(scene, rollouts))[..., 0]
+    ranking = RealismRanking()(scene, rollouts, torch.ones(3, dtype=torch.bool))
+    assert ranking.distance.argsort().tolist() == paid.sum(1).argsort(descending=True).tolist()
+    assert torch.equal(ranking.agent_distance[:, 0].argsort(), paid[:, 0].argsort(descending=True))
+    assert (ranking.agent_distance >= 0).all() and (ranking.agent_distance.amin(0) == 0).all()
+    assert ranking.ade.tolist() == pytest.approx([0, 4 / 6, 9 / 6, 1 / 6], rel=1e-3)
+
+
+def test_a_ranking_by_realism_finds_no_preference_among_equals_and_moves_with_its_group() -> None:
+    scene, everybody = straight_road(2), torch.ones(2, dtype=torch.bool)
+    alike = RealismRanking()(scene, lagging(scene, 4.0, 4.0, 4.0), everybody)
+    assert not alike.distance.any() and not alike.agent_distance.any()
+    nobody = RealismRanking()(scene, lagging(scene, 0.0, 4.0), ~everybody)
+    assert not nobody.distance.any() and not nobody.agent_ranked.any()
+
+
+def test_a_ranking_by_realism_refuses_what_the_metric_cannot_score() -> None:
+    scene = straight_road(2)
+    with pytest.raises(ValueError, match="realism is of 80 steps of 0.1 s, and rollouts have 40"):
+        RealismRanking()(scene, lagging(scene, 0.0, 4.0)[:, :, :40])
+    with pytest.raises(ValueError, match="one rollout is a group of its own"):
+        RealismRanking()(scene, lagging(scene, 0.0))
+    with pytest.raises((ValueError, OSError), match="1999"):
+        RealismRanking(metric="1999")
