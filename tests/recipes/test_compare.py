@@ -147,7 +147,7 @@ def test_policies_that_are_taken_over_are_judged_as_where_they_were_trained(
 def test_a_folder_is_taken_over_whole_once_and_not_trained_on(
     run: Callable, options: Callable, finished: Path, tmp_path: Path
 ) -> None:
-    taken, more = tmp_path / "taken", [*OTHERS, "~methods.adversarial_afd"]
+    taken, more = tmp_path / "taken", [*OTHERS, "~methods.sft_best_oa"]
     assert run("compare", *command(options, taken, *more, f"trained={finished}")).status == 0
     told = run("compare", *command(options, tmp_path / "again", *more, f"trained={taken}"))
     assert told.status == 2 and f"has its policies from {finished}; say trained={finished}" in told.err
