@@ -15,7 +15,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Sequence
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import hydra
@@ -39,12 +38,13 @@ from recipes.experiment.jobs import (
     pretrain_job,
     rerank_job,
     runs_of,
+    trained_in,
 )
 from recipes.experiment.logged import log_experiment
 from recipes.experiment.methods import checkpoints_of, levels, policies_of, read_setups
 from recipes.experiment.pictures import write_players
 from recipes.experiment.pool import Workers
-from recipes.experiment.runs import Run, RunFolder
+from recipes.experiment.runs import Run
 from recipes.experiment.stages import Stages, alone_in
 from recipes.experiment.summary import Chosen, summarise_experiment
 from recipes.report import report
@@ -62,7 +62,10 @@ def compare(cfg: DictConfig) -> dict[str, Any]:
         write_scene_cards(runs.scenes, splits)
         with Workers(cfg.workers, cfg.threads, spread=cfg.device == "cuda") as workers:
             stages = Stages(workers, runs.stages, made)
-            (train_policies if cfg.trained is None else adopt_policies)(cfg, stages)
+            if cfg.trained is None:
+                train_policies(cfg, stages)
+            else:
+                adopt_policies(cfg, stages)
             chosen = choose(cfg, stages)
             measure(cfg, stages, chosen)
         found = summarise_experiment(cfg, splits, chosen, stages) | made_by(cfg, stages) | {"command": made["command"]}
@@ -78,7 +81,7 @@ def made_by(cfg: DictConfig, stages: Stages) -> dict[str, Any]:
     """Code, machine and date of all that the result rests on, trainings elsewhere too."""
     if cfg.trained is None:
         return stages.made
-    theirs = read_json(RunFolder(Path(cfg.trained)).experiment(cfg.experiment.name))
+    theirs = read_json(trained_in(cfg).experiment(cfg.experiment.name))
     return merged([{name: each[name] for name in stages.made} for each in (theirs, stages.made)])
 
 

@@ -66,7 +66,7 @@ def read_study(folder: str | Path) -> Study:
     if not folder.is_dir():
         raise ValueError(f"{folder} is no folder; name the one that recipes.compare wrote (its output=...).")
     experiments = [read_experiment(path) for path in (folder / "experiments").glob("*.json")]
-    experiments.sort(key=lambda each: (each.path.stem != FIRST, each.split != "eval", each.path.stem))
+    experiments.sort(key=lambda each: (each.path.stem != FIRST, REPORTED.index(each.split), each.path.stem))
     summaries = {name: folder / name / "summary.json" for name in STUDIES}
     summaries = {name: read_json(path) for name, path in summaries.items() if path.is_file()}
     if not experiments and not summaries:

@@ -51,9 +51,7 @@ class RewardRollouts(RankRollouts):
 
     def entries(self, ranked: Sequence[Ranked], rows: int, decisions: int) -> dict[NestedKey, Tensor]:
         """The ranking, and the rewards."""
-        outcomes = [
-            Outcome(*group[:3], ranking=group.ranking, distance=self.distance, decisions=decisions) for group in ranked
-        ]
+        outcomes = [Outcome(**group._asdict(), distance=self.distance, decisions=decisions) for group in ranked]
         paid = {
             (keys.REWARDS, name): torch.stack([self._paid(name, one, rows) for one in outcomes])
             for name in self.rewards

@@ -24,9 +24,8 @@ from recipes.common.cli import check_steps, plain, told_of
 from recipes.common.limits import GROUPS, check_limits, is_number
 from recipes.common.models import policy_config
 from recipes.common.rankings import build_distance, ranking_options
-from recipes.experiment.jobs import reference_of
+from recipes.experiment.jobs import reference_of, trained_in
 from recipes.experiment.methods import policies_of, read_setups
-from recipes.experiment.runs import RunFolder
 from recipes.experiment.summary import labels
 
 CHECKPOINTS = ("last", "select", "all")
@@ -55,7 +54,10 @@ def check_experiment(cfg: DictConfig) -> None:
     RealismConfig.load(str(cfg.evaluation.metric))
     if not cfg.seeds or len(set(cfg.seeds)) < len(cfg.seeds):
         raise ValueError(f"seeds must be one or more, each once, got {list(cfg.seeds)}.")
-    _check_references(cfg) if cfg.trained is None else check_trained(cfg)
+    if cfg.trained is None:
+        _check_references(cfg)
+    else:
+        _check_trained(cfg)
     _check_decodings(cfg)
     check_collection(cfg.collection)
     _check_rankings(cfg)
@@ -92,15 +94,9 @@ def _check_references(cfg: DictConfig) -> None:
             reference_of(cfg, seed)
 
 
-def check_trained(cfg: DictConfig) -> None:
-    """Refuse a folder whose policies are to be taken over unless it has finished this experiment, by these options.
-
-    Raises:
-        ValueError: it has not, it lacks a policy, or it is this very folder.
-    """
-    if cfg.trained is None:
-        return
-    runs, name = RunFolder(Path(cfg.trained)), cfg.experiment.name
+def _check_trained(cfg: DictConfig) -> None:
+    """The folder whose policies are taken over is another one, which has finished this experiment by these options."""
+    runs, name = trained_in(cfg), cfg.experiment.name
     if runs.root.resolve() == Path(cfg.output).resolve():
         raise ValueError(f"trained={cfg.trained} is the output as well; name another output.")
     if not runs.experiment(name).is_file():
@@ -112,11 +108,9 @@ def check_trained(cfg: DictConfig) -> None:
         raise ValueError(f"trained={cfg.trained} has its policies from {origin}; say trained={origin}.")
     if differ := differences(_of_training(theirs, mine["methods"]), _of_training(mine, mine["methods"])):
         raise ValueError(f"trained={cfg.trained} was trained with other options than are told here: {differ}.")
-    missing = [
-        path for seed in cfg.seeds for each in policies_of(cfg) if not (path := runs.policy(seed, each)).is_file()
-    ]
-    if missing:
-        raise ValueError(f"{missing[0]} does not exist; finish the experiment there, or leave its seed or method out.")
+    needed = (runs.policy(seed, policy) for seed in cfg.seeds for policy in policies_of(cfg))
+    if missing := next((path for path in needed if not path.is_file()), None):
+        raise ValueError(f"{missing} does not exist; finish the experiment there, or leave its seed or method out.")
 
 
 def _of_training(config: Mapping[str, Any], methods: Iterable[str]) -> dict[str, Any]:

@@ -60,7 +60,7 @@ def reference_of(cfg: DictConfig, seed: int) -> Path:
 
 def adopt_job(cfg: DictConfig, seed: int, policy: str) -> None:
     """A reference, an aligned policy or a snapshot of the folder ``trained``."""
-    adopt(RunFolder(Path(cfg.trained)).policy(seed, policy), runs_of(cfg).policy(seed, policy))
+    adopt(trained_in(cfg).policy(seed, policy), runs_of(cfg).policy(seed, policy))
 
 
 def adopt(policy: Path, place: Path) -> None:
@@ -175,3 +175,8 @@ def likelihood_job(cfg: DictConfig, seed: int, policy: str, split: str) -> None:
 def runs_of(cfg: DictConfig) -> RunFolder:
     """The folder of the study."""
     return RunFolder(Path(cfg.output))
+
+
+def trained_in(cfg: DictConfig) -> RunFolder:
+    """The folder where policies were trained: another one than the study's where they are taken over."""
+    return runs_of(cfg) if cfg.trained is None else RunFolder(Path(cfg.trained))

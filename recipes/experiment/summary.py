@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import compress
-from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
@@ -20,9 +19,9 @@ from recipes.alignment.likelihoods import PROBED
 from recipes.common.cli import plain
 from recipes.common.scenes import Splits
 from recipes.evaluate import SCENE_FIGURES, mean_known
-from recipes.experiment.jobs import runs_of
+from recipes.experiment.jobs import runs_of, trained_in
 from recipes.experiment.methods import behind, setup_of
-from recipes.experiment.runs import SNAPSHOT, Run, RunFolder, method_of
+from recipes.experiment.runs import SNAPSHOT, Run, method_of
 from recipes.experiment.stages import Stages, read_account
 
 TOLD = ("name", "title", "paper", "question", "headline", "axis", "split", "published")
@@ -155,7 +154,7 @@ def summarise_experiment(cfg: DictConfig, splits: Splits, chosen: Chosen, stages
     standard = experiment["versus"] or experiment["headline"]
     tried = [(method, run._replace(decoding=each)) for method, run in at_best for each in grid]
     rivals = [run for run in at_best if run[0] not in (REFERENCE, standard)]
-    account = stages.account if cfg.trained is None else read_account(RunFolder(Path(cfg.trained)).stages)
+    account = read_account(trained_in(cfg).stages)
     return {name: experiment[name] for name in TOLD} | {
         "versus": standard,
         "metric": str(cfg.evaluation.metric),

@@ -221,10 +221,6 @@ def test_a_reward_of_another_shape_is_refused() -> None:
         RewardRollouts([scene], 2, rewards=mine)(two_rollouts(scene))
 
 
-if __name__ == "__main__":
-    pytest.main([__file__])
-
-
 def test_a_ranking_by_realism_puts_first_what_the_reward_pays_most() -> None:
     scene = straight_road(3)
     rollouts = lagging(scene, 0.0, 4.0, 9.0, 1.0)
@@ -252,3 +248,7 @@ def test_a_ranking_by_realism_refuses_what_the_metric_cannot_score() -> None:
         RealismRanking()(scene, lagging(scene, 0.0))
     with pytest.raises((ValueError, OSError), match="1999"):
         RealismRanking(metric="1999")
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])
