@@ -70,7 +70,8 @@ def test_a_folder_of_another_reference_is_refused(tmp_path: Path) -> None:
 def test_a_comparison_runs_from_a_reference_of_the_zoo(run: Callable, options: Callable, tmp_path: Path) -> None:
     small = ["model.context.max_pieces=256", f"reference={NANO}", "seeds=[0]", "workers=1", "pictures.scenes=0"]
     grid = ["decoding.grid=[[0.95,1.0]]", "decoding.num_rollouts=2", "alignment.snapshots=[]", "drift_rollouts=1"]
-    fewer = ["~methods.sft_best_oa", "~methods.sft_best_ade", "~methods.adversarial_afd", "experiment.checkpoints=last"]
+    fewer = [f"~{part}" for part in ("methods.sft_best_oa", "methods.sft_best_ade", "methods.adversarial_afd")]
+    fewer += ["~experiment.setup.adversarial_afd", "experiment.checkpoints=last"]
     outcome = run("compare", *options("compare", *small, *grid, *fewer, f"output={tmp_path}"))
     assert outcome.status == 0, outcome.err
     assert "reference" in outcome.out and (tmp_path / "index.html").is_file()
