@@ -13,7 +13,12 @@ from envs.files import whole
 INK, QUIET, RULE = "#3c4043", "#8b9096", "#e3e5e8"
 VERDICTS = {"better": "#2a78b5", "worse": "#d55e00", "open": "#8b9096"}
 """Colours of what may be said of a difference; see :func:`dpa.report.statistics.verdict`."""
-CYCLE = ("#2a78b5", "#d55e00", "#009e73", "#b0509a", "#c79a1b", "#56b4e9", "#6b6b6b", "#000000")
+CYCLE = (
+    "#2a78b5", "#d55e00", "#009e73", "#b0509a", "#c79a1b", "#56b4e9", "#6b6b6b",
+    "#7a4b2a", "#1b3a7a", "#c1121f", "#7d8f00", "#8f7fe0", "#00a6a6", "#f08fb0",
+    "#000000",
+)  # fmt: skip
+"""Colours of what is told apart; the first seven also by those who see few colours."""
 
 
 def blank_figure(width: float, height: float) -> Figure:

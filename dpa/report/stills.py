@@ -9,6 +9,7 @@ from pathlib import Path
 
 import plotly.graph_objects as go
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator
 
 from dpa.report.canvas import INK, QUIET, blank_figure, calm, save_figure
@@ -25,6 +26,8 @@ FIGURES = ("sharpness", "scaling", "compute", "likelihood", "health")
 DASHES = {None: "-", "solid": "-", "dot": ":", "dash": "--"}
 POINT = 0.75
 """Points of Matplotlib in a pixel of the page."""
+WITHIN = 6
+"""Most entries of a legend that stands within the axes."""
 
 
 def experiment_charts(experiment: Experiment, folder: Path) -> dict[str, list[Chart]]:
@@ -35,9 +38,9 @@ def experiment_charts(experiment: Experiment, folder: Path) -> dict[str, list[Ch
         folder: of the study.
 
     Returns:
-        ``sharpness``: realism over the spread of rollouts; ``scaling``: figure 7 of the paper; ``compute``:
-        realism over minutes; ``likelihood``: its
-        figures 4 and 6; ``health``: logits, saturation, KL, entropy and pair accuracy along training.
+        ``sharpness``: realism over the spread of rollouts; ``scaling``: figure 7 of the paper; ``compute``: realism
+        over minutes; ``likelihood``: its figures 4 and 6; ``health``: logits, saturation, KL, entropy and pair accuracy
+        along training.
     """
     colours = palette(experiment.methods)
     likelihood, health = training_charts(experiment, folder, colours)
@@ -72,6 +75,10 @@ def draw_charts(charts: Sequence[Chart], path: str | Path) -> None:
     """
     if not charts:
         raise ValueError(f"{path}: there is no figure to draw.")
+    save_figure(_drawn(charts), path)
+
+
+def _drawn(charts: Sequence[Chart]) -> Figure:
     columns = min(len(charts), 3)
     rows = math.ceil(len(charts) / columns)
     width, height = (8.0, 4.4) if len(charts) == 1 else (4.4 * columns, 3.4 * rows)
@@ -81,7 +88,15 @@ def draw_charts(charts: Sequence[Chart], path: str | Path) -> None:
         _draw(axes, chart)
     for axes in places[len(charts) :]:
         axes.set_visible(False)
-    save_figure(figure, path)
+    named = [axes for axes, chart in zip(places, charts, strict=False) if chart.figure.layout.showlegend]
+    entries = {label: line for axes in named for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    look = {"frameon": False, "fontsize": 7, "labelcolor": INK}
+    if len(charts) == 1 and 1 < len(entries) <= WITHIN:
+        places[0].legend(**look)
+    elif entries:  # of all figures, below them
+        columns = min(len(entries), round(figure.get_figwidth() / 2.6))
+        figure.legend(entries.values(), entries, loc="outside lower left", ncols=columns, **look)
+    return figure
 
 
 def _draw(axes: Axes, chart: Chart) -> None:
@@ -101,8 +116,6 @@ def _draw(axes: Axes, chart: Chart) -> None:
         axes.axhline(0, color=QUIET, lw=0.8, zorder=1)
     if layout.yaxis.rangemode == "nonnegative":
         axes.set_ylim(bottom=0)
-    if layout.showlegend:
-        axes.legend(frameon=False, fontsize=7, labelcolor=INK)
 
 
 def _trace(axes: Axes, trace: go.Scatter) -> None:

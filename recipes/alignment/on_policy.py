@@ -107,6 +107,7 @@ class OnPolicyStep:
         self.workers = build(Workers, options.workers, "alignment.workers")
         self.most, self.sizes = rows_within(options.memory, model, context), partial(agents_of, scenes, options=context)
         decoding, distance = check_rolling(data)
+        self.ranked_by = "missed" if data.ranking.get("kind") == "realism" else "distance"
         check_horizon(self.rewards, context.decision_steps * context.horizon)
         paid = {name: REWARDS[name] for name in self.rewards}
         job = RolloutJob(
@@ -132,8 +133,9 @@ class OnPolicyStep:
 
         Returns:
             What the loss logs in the last pass, ``gradient_norm`` before clipping, what the rollouts are like
-            (``rollout_distance``, ``rollout_ade`` and ``rollout_spread`` [m], of a policy gradient
-            ``rollout_pair_accuracy``: how often the nearer of a pair of them is the likelier one), the rewards
+            (``rollout_distance``, or, ranked by realism, ``rollout_missed`` of it; ``rollout_ade`` and
+            ``rollout_spread`` [m]; of a policy gradient ``rollout_pair_accuracy``: how often the nearer of a pair of
+            them is the likelier one), the rewards
             (``reward_NAME``), the ``staleness`` of their weights [steps], and how long they and what is learnt from
             them take (``seconds_rollout``, ``seconds_learning``).
         """
@@ -194,7 +196,7 @@ class OnPolicyStep:
         each = moved / moved.sum().clamp(min=1)
         paid = {name: ranked[keys.REWARDS, name][..., 0].mean(0) for name in self.rewards}
         return {
-            "rollout_distance": float(ranked[keys.DISTANCE].mean()),
+            f"rollout_{self.ranked_by}": float(ranked[keys.DISTANCE].mean()),
             "rollout_ade": float(ranked[keys.ADE].mean()),
             "rollout_spread": float((each * ranked[keys.SPREAD]).sum()),
             "staleness": float(one.staleness),

@@ -93,14 +93,16 @@ def test_pairs_of_its_own_may_be_any(
     assert len(read_curve(tmp_path, "train/loss_preference")) == 2
 
 
-@pytest.mark.parametrize("ranking", ["realism", "displacement"])
+@pytest.mark.parametrize(("ranking", "told"), [("realism", "missed"), ("displacement", "distance")])
 def test_pairs_of_its_own_may_be_ranked_by_another_distance(
-    run: Callable, options: Callable, origin: Path, tmp_path: Path, ranking: str
+    run: Callable, options: Callable, origin: Path, tmp_path: Path, ranking: str, told: str
 ) -> None:
     more = ("alignment.steps=2", f"ranking@method.data.ranking={ranking}", "method.loss.credit=agent")
     outcome = run("align", *aligning(options, origin, "dpa_omf_on_policy", tmp_path, *more))
     assert outcome.status == 0, outcome.err
     assert max(value for _, value in read_curve(tmp_path, "train/gradient_norm")) > 0
+    rolled = {path.stem for path in (tmp_path / "scalars/train").glob("rollout_*.csv")}
+    assert rolled == {f"rollout_{told}", "rollout_ade", "rollout_spread"}
 
 
 @pytest.mark.slow

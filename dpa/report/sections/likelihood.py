@@ -30,6 +30,7 @@ HEALTH = {
     "tune/pair_accuracy": ("Pair accuracy", "share of pairs"),
     "tune/reward_accuracy": ("Reward accuracy", "share of pairs"),
     "train/rollout_distance": ("Own rollouts of a step: distance to the log", "preference distance"),
+    "train/rollout_missed": ("Own rollouts of a step: realism missed", "sum over agents, to the group's best"),
     "train/rollout_spread": ("Own rollouts: how far apart they end", "spread [m]"),
     "train/rollout_pair_accuracy": ("Own rollouts: pair accuracy", "share of pairs"),
     "train/seconds_rollout": ("Rolling out and ranking", "seconds of a step"),

@@ -10,11 +10,10 @@ import pytest
 from matplotlib.axes import Axes
 from PIL import Image
 
-from dpa.report.canvas import blank_figure
 from dpa.report.charts import Chart, Line, curves, palette
 from dpa.report.experiment import read_experiment
 from dpa.report.sections.compute import compute_charts
-from dpa.report.stills import FIGURES, _draw, draw_charts, experiment_charts
+from dpa.report.stills import FIGURES, _drawn, draw_charts, experiment_charts
 from dpa.report.study import read_study
 from recipes.report import report
 from tests.dpa.report.runs import write_runs
@@ -26,8 +25,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def drawn(chart: Chart) -> Axes:
-    axes = blank_figure(4, 3).subplots()
-    _draw(axes, chart)
+    (axes,) = _drawn([chart]).axes
     return axes
 
 
@@ -87,6 +85,18 @@ def test_lines_have_their_values_gaps_names_and_colours() -> None:
     assert any(list(line.get_ydata()) == [0, 0] for line in axes.get_lines()), "y = 0 is marked"
     sizes = axes.collections[0].get_sizes()
     assert sizes[2] / sizes[0] == pytest.approx((15 / 6) ** 2), "markers are as large beside each other as on the page"
+
+
+def test_many_figures_or_many_lines_have_one_legend_below_them_and_each_method_a_colour() -> None:
+    names = [f"method {number}" for number in range(14)]
+    colours = palette(["reference", *names])
+    assert len(set(colours.values())) == 15
+    chart = curves([Line(name, [0, 1], [0, 1], colours[name]) for name in names], "Many", x="step", y="realism")
+    for charts in ([chart], [chart, chart]):
+        figure = _drawn(charts)
+        assert all(axes.get_legend() is None for axes in figure.axes)
+        (legend,) = figure.legends
+        assert [text.get_text() for text in legend.get_texts()] == names
 
 
 def test_bars_reach_as_far_as_on_the_page_and_a_logarithmic_axis_has_a_tick_at_each_place() -> None:
