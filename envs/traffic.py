@@ -14,17 +14,10 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from envs import keys
+from envs.episode import EpisodeOptions
 from envs.geometry.frames import to_world
-from envs.participants import (
-    MAX_CONTROLLED,
-    Control,
-    check_control,
-    choose_controlled,
-    largest_scene,
-    pad_agents,
-    simulated_agents,
-)
-from envs.scene import CURRENT_STEP, AgentKind, Scene, SceneSource, check_episode, collate
+from envs.participants import largest_scene, pad_agents, simulated_agents
+from envs.scene import CURRENT_STEP, AgentKind, Scene, SceneSource, collate
 from envs.signals import Signals
 
 
@@ -49,26 +42,20 @@ class TrafficEnv(EnvBase):
 
     Args:
         scenes: where scenes come from.
+        episode: who takes part, whom a policy moves, and for how long.
 
     Keyword Args:
         num_scenes: S.
         num_rollouts: K.
         num_agents: A; by default the largest number of agents of any scene in ``scenes``, for which ``arrivals`` reads
             them all.
-        max_controlled: agents of a scene that are controlled at most.
-        control: ``"all"``, ``"sdc"``, ``"predict"`` (the tracks to predict), or a function that is given one scene with
-            its present agents and gives an ``[A]`` bool mask of them.
-        arrivals: agents that are logged in the episode but not at its beginning take part.
         signals: names of :data:`~envs.signals.SIGNALS` to compute in every decision: ``"collision"``, ``"offroad"``,
             ``"progress"``, ``"red_light"``; one that is not named costs nothing.
-        decision_steps: F, 1 to 10.
-        horizon: T, decisions in an episode.
         order: ``"sequential"`` takes the scenes in turn, ``"random"`` draws them with the environment's seed.
         device: where states live.
 
     Raises:
-        ValueError: no scenes, an option that makes no sense, a horizon beyond the log, or a scene with more than
-            ``num_agents`` agents.
+        ValueError: no scenes, an option that makes no sense, or a scene with more than ``num_agents`` agents.
 
     Examples:
         >>> from envs.sources.synthetic import straight_road
@@ -76,7 +63,7 @@ class TrafficEnv(EnvBase):
         >>> rollout = env.rollout(16)
         >>> rollout["next", "agents", "recent"].shape
         torch.Size([8, 16, 3, 6, 3])
-        >>> env = TrafficEnv([straight_road(3)], control="sdc", signals=("collision", "progress"), horizon=4)
+        >>> env = TrafficEnv([straight_road(3)], EpisodeOptions(control="sdc", horizon=4), signals=["collision"])
         >>> env.rollout(4)["next", "agents", "collision"].shape
         torch.Size([1, 4, 3])
     """
@@ -86,16 +73,12 @@ class TrafficEnv(EnvBase):
     def __init__(
         self,
         scenes: SceneSource,
+        episode: EpisodeOptions | None = None,
         *,
         num_scenes: int = 1,
         num_rollouts: int = 1,
         num_agents: int | None = None,
-        max_controlled: int = MAX_CONTROLLED,
-        control: Control = "all",
-        arrivals: bool = False,
         signals: Sequence[str] = (),
-        decision_steps: int = 5,
-        horizon: int = 16,
         order: Literal["sequential", "random"] = "sequential",
         device: torch.device | str = "cpu",
     ) -> None:
@@ -105,19 +88,12 @@ class TrafficEnv(EnvBase):
             raise ValueError("TrafficEnv needs at least one scene, got an empty source.")
         if order not in ("sequential", "random"):
             raise ValueError(f"order must be 'sequential' or 'random', got {order!r}.")
-        check_control(control)
-        sizes = {"num_scenes": num_scenes, "num_rollouts": num_rollouts, "max_controlled": max_controlled}
-        sizes |= {} if num_agents is None else {"num_agents": num_agents}
-        _check_positive(**sizes, decision_steps=decision_steps, horizon=horizon)
-        check_episode(decision_steps, horizon)
+        sizes = {} if num_agents is None else {"num_agents": num_agents}
+        _check_positive(num_scenes=num_scenes, num_rollouts=num_rollouts, **sizes)
         super().__init__(device=device, batch_size=[num_scenes * num_rollouts])
-        self.scenes = scenes
-        self.num_scenes, self.num_rollouts = num_scenes, num_rollouts
-        self.max_controlled, self.control = max_controlled, control
-        self.decision_steps, self.horizon = decision_steps, horizon
-        self.order = order
-        self._cast = {"arrivals": arrivals, "last_step": CURRENT_STEP + decision_steps * horizon}
-        self.num_agents = largest_scene(scenes, **self._cast) if num_agents is None else num_agents
+        self.scenes, self.episode = scenes, episode or EpisodeOptions()
+        self.num_scenes, self.num_rollouts, self.order = num_scenes, num_rollouts, order
+        self.num_agents = largest_scene(scenes, **self.episode.cast) if num_agents is None else num_agents
         self._signals = Signals(signals, num_rollouts, self.device) if signals else None
         self._cursor = 0
         self._generator = torch.Generator()
@@ -125,12 +101,12 @@ class TrafficEnv(EnvBase):
         self._make_specs()
 
     def _make_specs(self) -> None:
-        batch, agents, steps = self.batch_size, (*self.batch_size, self.num_agents), self.decision_steps
+        batch, agents, steps = self.batch_size, (*self.batch_size, self.num_agents), self.episode.decision_steps
         flag = {"n": 2, "dtype": torch.bool, "device": self.device}
         self.observation_spec = Composite(
             {
                 keys.SCENE: Bounded(0, len(self.scenes) - 1, shape=batch, dtype=torch.int64, device=self.device),
-                keys.STEP: Bounded(0, self.horizon, shape=(*batch, 1), dtype=torch.int64, device=self.device),
+                keys.STEP: Bounded(0, self.episode.horizon, shape=(*batch, 1), dtype=torch.int64, device=self.device),
                 keys.AGENTS: Composite(
                     recent=Unbounded(shape=(*agents, steps + 1, 3), device=self.device),
                     valid=Categorical(shape=agents, **flag),
@@ -188,16 +164,16 @@ class TrafficEnv(EnvBase):
         batch = collate(scenes).to(self.device)
         each = self._repeat
         agents = batch.agents
-        end = self._cast["last_step"] + 1
+        end = CURRENT_STEP + self.episode.steps + 1
         fresh = not hasattr(self, "_start")
-        self._start = each(agents.recent(self.decision_steps))
-        self._log = each(agents.poses[..., CURRENT_STEP + 1 : end, :].unflatten(-2, (-1, self.decision_steps)))
-        self._log_valid = each(agents.valid[..., CURRENT_STEP + 1 : end].unflatten(-1, (-1, self.decision_steps)))
+        self._start = each(agents.recent(self.episode.decision_steps))
+        self._log = each(agents.poses[..., CURRENT_STEP + 1 : end, :].unflatten(-2, (-1, self.episode.decision_steps)))
+        self._log_valid = each(
+            agents.valid[..., CURRENT_STEP + 1 : end].unflatten(-1, (-1, self.episode.decision_steps))
+        )
         self._present = each(agents.present)
         self._kind = each(agents.kind)
-        self._controlled = each(
-            torch.stack([choose_controlled(s, self.max_controlled, self.control) for s in scenes]).to(self.device)
-        )
+        self._controlled = each(torch.stack([self.episode.choose(scene) for scene in scenes]).to(self.device))
         if self._signals is not None:
             self._signals.load(self._scene.tolist(), scenes, batch)
         if fresh:
@@ -206,10 +182,10 @@ class TrafficEnv(EnvBase):
 
     def _padded(self, index: int) -> Scene:
         """One scene with the agents of the simulation only, padded to A."""
-        scene = simulated_agents(self.scenes[index], **self._cast)
+        scene = simulated_agents(self.scenes[index], **self.episode.cast)
         missing = self.num_agents - scene.agents.kind.shape[0]
         if missing < 0:
-            when = "in the episode" if self._cast["arrivals"] else "at the current step"
+            when = "in the episode" if self.episode.arrivals else "at the current step"
             raise ValueError(
                 f"scene {scene.scene_id} has {self.num_agents - missing} agents {when} and the environment holds "
                 f"{self.num_agents}; raise num_agents."
@@ -223,7 +199,7 @@ class TrafficEnv(EnvBase):
     # --- step -------------------------------------------------------------------------------------------------------
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         current = self._recent[..., -1:, :]
-        index = self._step_count[:, 0].clamp(max=self.horizon - 1)
+        index = self._step_count[:, 0].clamp(max=self.episode.horizon - 1)
         rows = torch.arange(len(index), device=self.device)
         log, log_valid = self._log[rows, :, index], self._log_valid[rows, :, index]
         before = None if self._signals is None else self._valid_now()
@@ -231,13 +207,13 @@ class TrafficEnv(EnvBase):
         poses = torch.where(self._controlled[..., None, None], moved, log)
         self._recent = torch.cat((current, poses), -2)
         self._step_count = self._step_count + 1
-        done = self._step_count >= self.horizon
+        done = self._step_count >= self.episode.horizon
         error = (poses[..., :2] - log[..., :2]).norm(dim=-1) * log_valid
         reward = -error.sum(-1) / log_valid.sum(-1).clamp(min=1)
         out = self._observe()
         if before is not None:
             later = torch.where(self._controlled[..., None], self._present[..., None], log_valid)
-            valid, first = torch.cat((before[..., None], later), -1), CURRENT_STEP + index * self.decision_steps
+            valid, first = torch.cat((before[..., None], later), -1), CURRENT_STEP + index * self.episode.decision_steps
             out[keys.AGENTS].update(self._signals.measure(self._recent, valid, self._controlled, first))
         out[keys.REWARD] = reward[..., None]
         out[keys.DONE], out[keys.TRUNCATED], out[keys.TERMINATED] = done, done.clone(), torch.zeros_like(done)
@@ -246,7 +222,7 @@ class TrafficEnv(EnvBase):
     def _valid_now(self) -> Tensor:
         """``[B, A]`` bool: the agent is there; a controlled one to the end, a replayed one while it is logged."""
         rows = torch.arange(len(self._recent), device=self.device)
-        last = (self._step_count[:, 0] - 1).clamp(0, self.horizon - 1)
+        last = (self._step_count[:, 0] - 1).clamp(0, self.episode.horizon - 1)
         logged = torch.where(self._step_count > 0, self._log_valid[rows, :, last, -1], self._present)
         return torch.where(self._controlled, self._present, logged)
 

@@ -143,12 +143,12 @@ def make_step(
     scenes = inputs.scenes.subset(inputs.learnt)
     if method.data.kind in ROLLED:
         loss = ranks.wrap(loss)
-        return OnPolicyStep(model, loss, scenes, inputs.context, method.data, options, seed, device, ranks)
+        return OnPolicyStep(model, loss, scenes, inputs.episode, method.data, options, seed, device, ranks)
     if method.data.kind == "closed_loop":
         check_data(method.data, 0)
         loss.set_keys(labels=keys.LABELS, learnt=keys.LEARNT)
         follow = {"candidates": method.data.candidates, "recovery": method.data.recovery}
-        return ClosedLoopStep(model, ranks.wrap(loss), scenes, inputs.context, follow, options, seed, device, ranks)
+        return ClosedLoopStep(model, ranks.wrap(loss), scenes, inputs.episode, follow, options, seed, device, ranks)
     candidates = inputs.candidates(method.data, seed)
     return AlignmentStep(model, ranks.wrap(loss), candidates, options, seed, device, ranks)
 

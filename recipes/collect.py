@@ -16,7 +16,7 @@ from pathlib import Path
 import hydra
 from omegaconf import DictConfig
 
-from dpa.policy import Decoding
+from dpa.models import Decoding
 from dpa.preferences import PreferenceStore, PreferenceWriter, Provenance, data_card
 from dpa.ranking import Distance
 from dpa.ranking.transform import RankRollouts
@@ -53,11 +53,11 @@ def collect(
     """
     indices = range(len(scenes)) if indices is None else indices
     options = cfg.collection
-    model, context, config = open_policy(policy, cfg.device)
+    model, episode, config = open_policy(policy, cfg.device)
     distance = distance or build_distance(options.ranking, "collection.ranking")
     # What is wrong with an option is told before a store is begun with it.
     decoding, workers = check_collection(options)
-    rows_within(options.memory, model, context)
+    rows_within(options.memory, model)
     provenance = Provenance(
         policy=weights_digest(model),
         scenes=fingerprint(scenes),
@@ -65,7 +65,7 @@ def collect(
         sampling=plain(options.decoding) | {"precision": options.precision},
         seed=seed,
         num_rollouts=options.num_rollouts,
-        horizon=context.horizon,
+        horizon=episode.horizon,
         vocab_size=model.tokenizer.vocab_size,
         tokenizer=config["tokenizer"],
     )
@@ -81,7 +81,7 @@ def collect(
                 indices=indices,
                 done=done,
                 decoding=decoding,
-                options=context,
+                options=episode,
                 seed=seed,
                 make_postproc=partial(RankRollouts, num_rollouts=options.num_rollouts, distance=distance),
                 workers=workers,

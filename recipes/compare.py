@@ -20,7 +20,7 @@ from typing import Any
 import hydra
 from omegaconf import DictConfig
 
-from dpa.policy import Decoding
+from dpa.models import Decoding
 from dpa.report.experiment import read_experiment, read_json
 from dpa.report.table import REFERENCE, print_table
 from envs.files import write_json

@@ -19,12 +19,12 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from dpa.discriminator import Discriminator, mean_squared_jerk, until_first_hole
-from dpa.policy import ContextOptions
 from dpa.ranking import Distance, occupancy_features
 from dpa.realism import RealismConfig, realism_of_groups
 from dpa.report.studies import plot_discriminator
 from dpa.tokens import MotionTokenizer
 from dpa.training.checkpoint import load_policy, load_weights, save_policy
+from envs.episode import EpisodeOptions
 from envs.files import write_json
 from envs.store import SceneStore
 from recipes.common.cli import CONFIG, build, finished, finite, plain, recipe
@@ -65,7 +65,7 @@ def trained(cfg: DictConfig, scenes: SceneStore, policy: Path, name: str) -> tup
     """
     folder, sight = Path(cfg.output) / name.replace("/", "_"), build(Sight, cfg.sight, "sight")
     result, weights = folder / "training.json", folder / "discriminator.pt"
-    model, context, _ = open_policy(policy, cfg.device)
+    model, episode, _ = open_policy(policy, cfg.device)
     shape = {"num_features": sight.width, "width": cfg.training.width}
     decided_by = {
         "policy": weights_digest(model),
@@ -83,8 +83,8 @@ def trained(cfg: DictConfig, scenes: SceneStore, policy: Path, name: str) -> tup
     rolled_by = {key: decided_by[key] for key in ("policy", "scenes", "sight", "decoding", "seed")}
     shelf = MotionShelf(folder / "motions", rolled_by | {"num_rollouts": cfg.training.num_rollouts})
     there = frozenset(shelf.scenes())
-    see = partial(seen, sight=sight, tokenizer=model.tokenizer.on_cpu(), options=context)
-    for each in rolled_out(cfg, scenes, model, context, cfg.training.num_rollouts, there, f"{name} rollouts"):
+    see = partial(seen, sight=sight, tokenizer=model.tokenizer.on_cpu(), options=episode)
+    for each in rolled_out(cfg, scenes, model, episode, cfg.training.num_rollouts, there, f"{name} rollouts"):
         shelf.put(each.index, see(each)[0])
     net, curve = fit(cfg.training, shape, shelf, folder, seed=cfg.seed, decided_by=decided_by, logger=cfg.logger)
     save_policy(weights, net.state_dict(), shape, {"seed": cfg.seed})
@@ -94,7 +94,7 @@ def trained(cfg: DictConfig, scenes: SceneStore, policy: Path, name: str) -> tup
     return net, done
 
 
-def seen(each: Rolled, sight: Sight, tokenizer: MotionTokenizer, options: ContextOptions) -> tuple[Any, Tensor]:
+def seen(each: Rolled, sight: Sight, tokenizer: MotionTokenizer, options: EpisodeOptions) -> tuple[Any, Tensor]:
     """The motions of a scene's log and rollouts, and the log ``[A, 80, 4]`` that they were compared with."""
     log = driven_log(each.scene, tokenizer, options, tokenized=sight.tokenized)
     return sight(each, log), log
@@ -106,7 +106,7 @@ def measure_scene(
     net: Discriminator,
     sight: Sight,
     tokenizer: MotionTokenizer,
-    options: ContextOptions,
+    options: EpisodeOptions,
     distance: Distance,
     metric: RealismConfig,
     seed: int,
@@ -118,7 +118,7 @@ def measure_scene(
         net: the discriminator.
         sight: what it sees.
         tokenizer: of the policy.
-        options: how the policy cuts scenes up.
+        options: of the episodes.
         distance: the preference distance.
         metric: the realism metric.
         seed: of the random groups.
@@ -207,7 +207,7 @@ def main(cfg: DictConfig) -> None:
     scenes, measured, training = splits[cfg.split], {}, {}
     for name, path in policies.items():
         net, training[name] = trained(cfg, splits.train, path, name)
-        model, context, _ = open_policy(path, "cpu")
+        model, episode, _ = open_policy(path, "cpu")
         decided_by = {
             "discriminator": weights_digest(net),
             "sight": plain(cfg.sight),
@@ -219,7 +219,7 @@ def main(cfg: DictConfig) -> None:
             net=net,
             sight=sight,
             tokenizer=model.tokenizer,
-            options=context,
+            options=episode,
             distance=distance,
             metric=metric,
             seed=cfg.seed,

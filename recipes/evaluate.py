@@ -15,7 +15,7 @@ import hydra
 import torch
 from omegaconf import DictConfig
 
-from dpa.policy import Decoding
+from dpa.models import Decoding
 from dpa.ranking import Distance, agent_spread
 from dpa.realism import RealismConfig, RealismResult, mean_result, realism
 from dpa.realism.submission import SubmissionWriter, plan_submission
@@ -75,7 +75,7 @@ def evaluate(
         ``scenes`` (ids) and ``per_scene`` (each figure as a list).
     """
     options = cfg.evaluation
-    model, context, _ = open_policy(policy, cfg.device)
+    model, episode, _ = open_policy(policy, cfg.device)
     distance = build_distance(cfg.collection.ranking, "collection.ranking")
     metric = RealismConfig.load(str(options.metric))
     decided_by = {
@@ -104,7 +104,7 @@ def evaluate(
             num_rollouts=options.num_rollouts,
             done=ready,
             decoding=decoding,
-            options=context,
+            options=episode,
             seed=seed,
             memory=options.memory,
             device=cfg.device,

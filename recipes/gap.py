@@ -25,14 +25,15 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from dpa.policy import ContextOptions, Decoding, MotionLM, collate_contexts, make_context
-from dpa.policy.sampling import draw
+from dpa.models import Decoding, MotionModel, collate_contexts, make_context
+from dpa.models.sampling import draw
 from dpa.realism import RealismConfig
 from dpa.realism.features import measure
 from dpa.realism.tracks import compare
 from dpa.report.statistics import Interval, summary
 from dpa.rollout import lifted
 from dpa.tokens import MotionTokenizer
+from envs.episode import EpisodeOptions, make_episode
 from envs.files import write_json
 from envs.geometry.frames import to_world
 from envs.options import differences
@@ -54,27 +55,28 @@ SECONDS = (2.0, 8.0)
 """When it is looked at what has happened so far."""
 
 
-def logs(scenes: SceneSource, options: ContextOptions, tokenizer: MotionTokenizer | None) -> Rolls:
+def logs(scenes: SceneSource, options: EpisodeOptions, tokenizer: MotionTokenizer | None) -> Rolls:
     """The log of every scene; where a tokenizer is given, that of the self-driving car as its tokens have it."""
     for index in range(len(scenes)):
         scene = scenes[index]
-        context = make_context(scene, replace(options, control="sdc"))
-        poses = context.logged
+        episode = make_episode(scene, replace(options, control="sdc"))
+        poses = episode.logged
         if tokenizer is not None:
-            tracks = tokenizer.encode_tracks(poses, context.logged_valid, context.recent, context.kind)
-            poses = torch.where(context.controlled[:, None, None], tracks.poses, poses)
+            tracks = tokenizer.encode_tracks(poses, episode.logged_valid, episode.recent, episode.kind)
+            poses = torch.where(episode.controlled[:, None, None], tracks.poses, poses)
         yield index, lifted(scene, poses[None])
 
 
 def single_decisions(
-    scenes: SceneSource, model: MotionLM, options: ContextOptions, decoding: Decoding, cfg: DictConfig
+    scenes: SceneSource, model: MotionModel, options: EpisodeOptions, decoding: Decoding, cfg: DictConfig
 ) -> Rolls:
     """Every decision of the self-driving car taken from where the log, through its tokens, has brought it."""
     options, tokenizer = replace(options, control="sdc"), model.tokenizer.on_cpu()
     for index in range(len(scenes)):
         scene = scenes[index]
-        context = make_context(scene, options)
-        tracks = tokenizer.encode_tracks(context.logged, context.logged_valid, context.recent, context.kind)
+        context = make_context(scene, model.featurize, options)
+        episode = context.episode
+        tracks = tokenizer.encode_tracks(episode.logged, episode.logged_valid, episode.recent, episode.kind)
         with torch.no_grad():
             batch = collate_contexts([context]).to(cfg.device)
             seen = (each.to(cfg.device) for each in (tracks.tokens[None, None], tracks.valid[None, None]))
@@ -83,11 +85,11 @@ def single_decisions(
             cfg.num_rollouts, *log_probs.shape[:-1], generator=make_generator(cfg.seed, "gap", scene.scene_id)
         )
         tokens = draw(log_probs.expand(cfg.num_rollouts, *log_probs.shape), uniform)
-        before = torch.cat((context.recent, tracks.poses), 1).unfold(1, tokenizer.steps + 1, tokenizer.steps)
+        before = torch.cat((episode.recent, tracks.poses), 1).unfold(1, tokenizer.steps + 1, tokenizer.steps)
         before = before.movedim(-1, -2)[:, : tokens.shape[-1]].expand(*tokens.shape, -1, -1)
-        kind = context.kind[:, None].expand_as(tokens)
+        kind = episode.kind[:, None].expand_as(tokens)
         moved = to_world(tokenizer.decode(tokens, before, kind), before[..., -1:, :]).flatten(2, 3)
-        yield index, lifted(scene, torch.where(context.controlled[:, None, None], moved, context.logged))
+        yield index, lifted(scene, torch.where(episode.controlled[:, None, None], moved, episode.logged))
 
 
 def rows(cfg: DictConfig) -> Iterator[tuple[str, dict[str, Any], Callable[[SceneSource], Rolls]]]:

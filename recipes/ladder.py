@@ -28,7 +28,7 @@ from envs.progress import progress
 from envs.scene import CURRENT_STEP, STEP_SECONDS, Scene, SceneSource
 from envs.seeding import make_generator
 from recipes.common.cli import CONFIG, finite, plain, recipe
-from recipes.common.models import build_policy, context_options, open_policy, policies_of, policy_config, weights_digest
+from recipes.common.models import build_policy, episode_options, open_policy, policies_of, policy_config, weights_digest
 from recipes.common.rolled import driven
 from recipes.common.scenes import fingerprint, open_splits
 from recipes.studies.rows import read_or_score
@@ -128,7 +128,7 @@ def rungs(cfg: DictConfig, scenes: SceneSource) -> Iterator[tuple[str, dict[str,
     seed_everything(seed)
     untrained = build_policy(config)
     decoding = {"decoding": plain(cfg.decoding)}
-    models = {"untrained model": (untrained, context_options(cfg.model), config)}
+    models = {"untrained model": (untrained, episode_options(cfg.model), config)}
     for name, path in (policies_of(cfg) if cfg.policies else {}).items():
         models[name] = open_policy(path, cfg.device)
     made = {

@@ -162,7 +162,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     parts = make_plan(rates, memory, options)
-    where = f"{measured['size']} model, {measured['device']}, {measured['threads']} threads"
+    where = f"{measured['model']} model, {measured['device']}, {measured['threads']} threads"
     table = Table(
         "",
         "hours",

@@ -19,7 +19,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from dpa.policy import Decoding
+from dpa.models import Decoding
 from dpa.ranking import Distance, PreferenceDistance
 from dpa.report.film import film_likely
 from dpa.report.judged import JudgedRollouts, judge_rollouts
@@ -73,14 +73,14 @@ def roll_out(
         raise ValueError(f"the player shows couplings, and {distance} couples nothing; give kind: preference.")
     judged: dict[int, dict[str, JudgedRollouts]] = {index: {} for index in wanted}
     for name, path in policies.items():
-        model, context, _ = open_policy(path, device)
+        model, episode, _ = open_policy(path, device)
         batches = make_collector(
             scenes,
             model,
             num_rollouts=num_rollouts,
             indices=wanted,
             decoding=_decoding_of(name, decoding),
-            options=context,
+            options=episode,
             seed=seed,
             device=device,
         )
@@ -113,7 +113,7 @@ def log_likelihood(batch: TensorDictBase, num_rollouts: int) -> Tensor:
         where there are none.
 
     Examples:
-        >>> from dpa.policy import MotionLM
+        >>> from dpa.models.motionlm import MotionLM
         >>> from dpa.tokens import VerletTokenizer
         >>> from envs.sources.synthetic import straight_road
         >>> model = MotionLM("nano", VerletTokenizer())

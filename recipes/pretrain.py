@@ -23,7 +23,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from dpa.losses import NextTokenLoss, token_network
-from dpa.policy import MotionLM
+from dpa.models import MotionModel
 from dpa.training.batches import Item, collate_items, micro_batches
 from dpa.training.checkpoint import load_policy, load_weights
 from dpa.training.distributed import ALONE, Ranks, join_ranks
@@ -42,8 +42,8 @@ from recipes.common.cli import CONFIG, build, check_steps, deciding, finished, r
 from recipes.common.models import (
     build_policy,
     check_written,
-    context_options,
     digest_of,
+    episode_options,
     policy_config,
     policy_file,
     write_policy,
@@ -152,7 +152,7 @@ def pretrain(
     return path
 
 
-def look(run: Run, model: MotionLM, best: MotionLM, tune: list[Item], device: str, ranks: Ranks = ALONE) -> None:
+def look(run: Run, model: MotionModel, best: MotionModel, tune: list[Item], device: str, ranks: Ranks = ALONE) -> None:
     """Measure the model on the tuning scenes; ``best`` becomes its copy where it is better than all before."""
     measured = negative_log_likelihood(model, tune, device, ranks)
     run.log({f"tune/{key}": value for key, value in measured.items()})
@@ -190,7 +190,7 @@ class Origin:
         weights, config, made = load_policy(file)
         return cls(file, weights, config, made, digest_of(weights))
 
-    def load_into(self, model: MotionLM, config: dict[str, Any]) -> None:
+    def load_into(self, model: MotionModel, config: dict[str, Any]) -> None:
         """Give a model these weights.
 
         Raises:
@@ -214,14 +214,15 @@ def parts_of(items: list[Item], max_rows: int, device: str, ranks: Ranks = ALONE
 
 
 def training_items(
-    cfg: DictConfig, scenes: SceneSource, model: MotionLM, seed: int, ranks: Ranks = ALONE
+    cfg: DictConfig, scenes: SceneSource, model: MotionModel, seed: int, ranks: Ranks = ALONE
 ) -> SceneLoader:
     """Lists of tokenized logs for this rank, read as they are needed: what is kept of them is bounded."""
     options = cfg.pretraining
     logs = LogItems(
         scenes,
         model.tokenizer.on_cpu(),
-        context_options(cfg.model),
+        model.featurize,
+        episode_options(cfg.model),
         augment=build(Augmentation, options.augmentation, "pretraining.augmentation"),
         noise=options.noise,
         recovery=options.recovery,
@@ -241,23 +242,25 @@ def training_items(
     )
 
 
-def tuning_items(cfg: DictConfig, scenes: SceneSource, model: MotionLM, ranks: Ranks = ALONE) -> list[Item]:
+def tuning_items(cfg: DictConfig, scenes: SceneSource, model: MotionModel, ranks: Ranks = ALONE) -> list[Item]:
     """This rank's part of the tokenized logs of a few scenes, always the same."""
-    options = context_options(cfg.model)
-    logs = LogItems(scenes, model.tokenizer.on_cpu(), options, max_agents=cfg.pretraining.max_agents)
+    options = episode_options(cfg.model)
+    logs = LogItems(scenes, model.tokenizer.on_cpu(), model.featurize, options, max_agents=cfg.pretraining.max_agents)
     bar = progress(ranks.mine(range(len(scenes))), "tokens", unit="scene", disable=not ranks.main)
     items = logs.collate([logs.prepare(index, make_generator(0, "tune", index)) for index in bar])
     if not ranks.sum(torch.tensor(sum(int(item.token_valid.sum()) for item in items))):
         raise ValueError(
             f"none of the {len(scenes)} tuning scenes has a token to predict: no agent that the policy controls "
-            f"(model.context.control={options.control}) has a log after the current step; say "
-            "model.context.control=all, or name other scenes.tune."
+            f"(model.episode.control={options.control}) has a log after the current step; say "
+            "model.episode.control=all, or name other scenes.tune."
         )
     return items
 
 
 @torch.no_grad()
-def negative_log_likelihood(model: MotionLM, items: list[Item], device: str, ranks: Ranks = ALONE) -> dict[str, float]:
+def negative_log_likelihood(
+    model: MotionModel, items: list[Item], device: str, ranks: Ranks = ALONE
+) -> dict[str, float]:
     """Per valid token [nats]: ``nll`` of all agents and ``nll_moving`` of those whose velocity changes at all.
 
     A standing agent repeats one token and is easy; it would hide how moving agents are predicted. Each rank gives the

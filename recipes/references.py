@@ -18,7 +18,7 @@ import hydra
 from omegaconf import DictConfig
 
 from dpa import zoo
-from dpa.policy import Decoding
+from dpa.models import Decoding
 from dpa.report.experiment import read_json
 from dpa.report.statistics import summary
 from dpa.report.studies import plot_references

@@ -12,14 +12,14 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
-from dpa.policy import ContextOptions, make_context
 from dpa.tokens import MotionTokenizer
+from envs.episode import EpisodeOptions, make_episode
 from envs.files import write_json
 from envs.geometry.frames import wrap_angle
 from envs.progress import progress
 from envs.scene import STEP_SECONDS, AgentKind, SceneSource
 from recipes.common.cli import CONFIG, plain, recipe
-from recipes.common.models import build_policy, context_options, policy_config
+from recipes.common.models import build_policy, episode_options, policy_config
 from recipes.common.scenes import open_splits
 
 CLASSES = (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST)
@@ -28,7 +28,7 @@ MOVING = 1.0
 
 
 def reconstruction_errors(
-    scenes: SceneSource, tokenizer: MotionTokenizer, options: ContextOptions
+    scenes: SceneSource, tokenizer: MotionTokenizer, options: EpisodeOptions
 ) -> dict[str, dict[str, float]]:
     """Errors of each class over all poses that tokens were encoded from.
 
@@ -38,17 +38,17 @@ def reconstruction_errors(
     """
     found: dict[str, list[torch.Tensor]] = {}
     for index in progress(range(len(scenes)), "tokens", unit="scene"):
-        context = make_context(scenes[index], options)
-        tracks = tokenizer.encode_tracks(context.logged, context.logged_valid, context.recent, context.kind)
-        valid = context.logged_valid & tracks.valid.repeat_interleave(tokenizer.steps, -1)
-        error = (tracks.poses - context.logged)[..., :2].norm(dim=-1)
-        heading = wrap_angle(tracks.poses[..., 2] - context.logged[..., 2]).abs().rad2deg()
-        speed = [p[..., :2].diff(dim=-2).norm(dim=-1) / STEP_SECONDS for p in (tracks.poses, context.logged)]
+        episode = make_episode(scenes[index], options)
+        tracks = tokenizer.encode_tracks(episode.logged, episode.logged_valid, episode.recent, episode.kind)
+        valid = episode.logged_valid & tracks.valid.repeat_interleave(tokenizer.steps, -1)
+        error = (tracks.poses - episode.logged)[..., :2].norm(dim=-1)
+        heading = wrap_angle(tracks.poses[..., 2] - episode.logged[..., 2]).abs().rad2deg()
+        speed = [p[..., :2].diff(dim=-2).norm(dim=-1) / STEP_SECONDS for p in (tracks.poses, episode.logged)]
         speed_error = torch.nn.functional.pad((speed[0] - speed[1]).abs(), (1, 0))
         both = torch.nn.functional.pad(valid[:, 1:] & valid[:, :-1], (1, 0))
-        away = ((context.logged - context.recent[:, -1:])[..., :2].norm(dim=-1) * context.logged_valid).amax(-1)
+        away = ((episode.logged - episode.recent[:, -1:])[..., :2].norm(dim=-1) * episode.logged_valid).amax(-1)
         for kind in CLASSES:
-            for name, chosen in (("all", context.kind == kind), ("moving", (context.kind == kind) & (away > MOVING))):
+            for name, chosen in (("all", episode.kind == kind), ("moving", (episode.kind == kind) & (away > MOVING))):
                 rows = valid[chosen]
                 sums = found.setdefault(f"{kind.name.lower()} {name}", [])
                 sums.append(
@@ -82,7 +82,7 @@ def _statistics(values: torch.Tensor) -> dict[str, float]:
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.tokens``."""
     model, scenes = build_policy(policy_config(cfg.model)), open_splits(cfg.scenes)[cfg.split]
-    errors = reconstruction_errors(scenes, model.tokenizer, context_options(cfg.model))
+    errors = reconstruction_errors(scenes, model.tokenizer, episode_options(cfg.model))
     table = Table("agents", "poses", "position mean [m]", "p99 [m]", "heading mean [deg]", "speed mean [m/s]")
     for name, row in errors.items():
         table.add_row(name, *(f"{value:.3f}" if isinstance(value, float) else str(value) for value in row.values()))

@@ -18,12 +18,14 @@ from torch import Tensor
 from dpa.gymnasium_adapter.observation import Observer, Sight
 from dpa.tokens import MotionTokenizer, VerletTokenizer
 from envs import keys
+from envs.episode import EpisodeOptions
+from envs.participants import MAX_CONTROLLED
 from envs.render import render_frame
 from envs.rewards import weighted_reward
 from envs.scene import CURRENT_STEP, STEP_SECONDS, SceneSource
 from envs.signals import SIGNALS
 from envs.store import SceneStore
-from envs.traffic import MAX_CONTROLLED, TrafficEnv
+from envs.traffic import TrafficEnv
 
 WEIGHTS: Mapping[str, float] = MappingProxyType(
     {"progress": 0.1, "collision": -1.0, "offroad": -1.0, "red_light": -1.0}
@@ -107,11 +109,13 @@ class TrafficGym(gymnasium.Env[Observation, Any]):
         self._events = [name for name in signals if name in SIGNALS and SIGNALS[name].dtype is torch.bool]
         self._env = TrafficEnv(
             open_scenes(scenes),
-            max_controlled=max_controlled,
-            control=control,
+            EpisodeOptions(
+                max_controlled=max_controlled,
+                decision_steps=self.tokenizer.steps,
+                horizon=horizon,
+                control=control,
+            ),
             signals=signals,
-            decision_steps=self.tokenizer.steps,
-            horizon=horizon,
             order="random",
         )
         self._rows = None if control == "sdc" else min(self._env.num_agents, max_controlled)
@@ -135,7 +139,7 @@ class TrafficGym(gymnasium.Env[Observation, Any]):
         self._scene = self._env.scenes[int(self._state[keys.SCENE])]
         self._egos = self._state[keys.CONTROLLED].nonzero()[:, 0]
         self._sdc = self._scene.agents.sdc[self._scene.agents.present].nonzero()[:, 0]
-        self._observer = Observer(self._scene, self.sight, self._env.horizon)
+        self._observer = Observer(self._scene, self.sight, self._env.episode.horizon)
         self._displacement, self._happened = 0.0, dict.fromkeys(self._events, torch.zeros(len(self._egos)).bool())
         self._poses: list[Tensor] = []
         return self._observe(), self._info()

@@ -83,13 +83,15 @@ class ContrastivePreferenceLoss(PreferenceLoss):
     Examples:
         >>> from tensordict import TensorDict
         >>> from dpa.losses import token_network
-        >>> from dpa.policy import MotionLM, collate_contexts, make_context
+        >>> from dpa.models import collate_contexts, make_context
+        >>> from dpa.models.motionlm import MotionLM
         >>> from dpa.tokens import VerletTokenizer
         >>> from envs.sources.synthetic import straight_road
-        >>> loss = ContrastivePreferenceLoss(token_network(MotionLM("nano", VerletTokenizer())))
+        >>> model = MotionLM("nano", VerletTokenizer())
+        >>> loss = ContrastivePreferenceLoss(token_network(model))
         >>> batch = TensorDict(
         ...     {
-        ...         "context": collate_contexts([make_context(straight_road(2))]),
+        ...         "context": collate_contexts([make_context(straight_road(2), model.featurize)]),
         ...         "preferred": torch.full((1, 4, 2, 16), 84),
         ...         "unpreferred": torch.full((1, 4, 2, 16), 90),
         ...         "token_valid": torch.ones(1, 1, 2, 16, dtype=torch.bool),

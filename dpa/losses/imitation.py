@@ -29,13 +29,15 @@ class ImitationLoss(NextTokenLoss):
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from dpa.losses import token_network
-        >>> from dpa.policy import MotionLM, collate_contexts, make_context
+        >>> from dpa.models import collate_contexts, make_context
+        >>> from dpa.models.motionlm import MotionLM
         >>> from dpa.tokens import VerletTokenizer
         >>> from envs.sources.synthetic import straight_road
-        >>> loss = ImitationLoss(token_network(MotionLM("nano", VerletTokenizer()).eval()))
+        >>> model = MotionLM("nano", VerletTokenizer()).eval()
+        >>> loss = ImitationLoss(token_network(model))
         >>> batch = TensorDict(
         ...     {
-        ...         "context": collate_contexts([make_context(straight_road(2))]),
+        ...         "context": collate_contexts([make_context(straight_road(2), model.featurize)]),
         ...         "tokens": torch.full((1, 1, 2, 16), 84),
         ...         "token_valid": torch.ones(1, 1, 2, 16, dtype=torch.bool),
         ...     },

@@ -38,13 +38,15 @@ class KahnemanTverskyLoss(PreferenceLoss):
     Examples:
         >>> from tensordict import TensorDict
         >>> from dpa.losses import token_network
-        >>> from dpa.policy import MotionLM, collate_contexts, make_context
+        >>> from dpa.models import collate_contexts, make_context
+        >>> from dpa.models.motionlm import MotionLM
         >>> from dpa.tokens import VerletTokenizer
         >>> from envs.sources.synthetic import straight_road
-        >>> loss = KahnemanTverskyLoss(token_network(MotionLM("nano", VerletTokenizer())), undesirable_weight=0.5)
+        >>> model = MotionLM("nano", VerletTokenizer())
+        >>> loss = KahnemanTverskyLoss(token_network(model), undesirable_weight=0.5)
         >>> batch = TensorDict(
         ...     {
-        ...         "context": collate_contexts([make_context(straight_road(2))]),
+        ...         "context": collate_contexts([make_context(straight_road(2), model.featurize)]),
         ...         "preferred": torch.full((1, 2, 2, 16), 84),
         ...         "unpreferred": torch.full((1, 3, 2, 16), 90),
         ...         "token_valid": torch.ones(1, 1, 2, 16, dtype=torch.bool),

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModule, TensorDictParams
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
-from dpa.policy.precision import Precision, check_precision, running_in
+from dpa.models.precision import Precision, check_precision, running_in
 from envs import keys
 
 CONTEXT = "context"
@@ -35,7 +35,7 @@ def token_network(model: nn.Module, precision: Precision = "float32") -> TensorD
 
     Args:
         model: called with a context of batch size ``[S]``, tokens ``[S, M, A, T]`` and their validity
-            ``[S, M or 1, A, T]``; gives logits ``[S, M, A, T, V]`` (:class:`~dpa.policy.MotionLM` does).
+            ``[S, M or 1, A, T]``; gives logits ``[S, M, A, T, V]`` (:class:`~dpa.models.MotionModel` does).
         precision: of its linear layers; weights, gradients and logits are float32 all the same.
 
     Returns:

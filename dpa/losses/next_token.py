@@ -33,13 +33,15 @@ class NextTokenLoss(LossModule):
 
     Examples:
         >>> from dpa.losses import token_network
-        >>> from dpa.policy import MotionLM, collate_contexts, make_context
+        >>> from dpa.models import collate_contexts, make_context
+        >>> from dpa.models.motionlm import MotionLM
         >>> from dpa.tokens import VerletTokenizer
         >>> from envs.sources.synthetic import straight_road
-        >>> loss = NextTokenLoss(token_network(MotionLM("nano", VerletTokenizer())))
+        >>> model = MotionLM("nano", VerletTokenizer())
+        >>> loss = NextTokenLoss(token_network(model))
         >>> batch = TensorDict(
         ...     {
-        ...         "context": collate_contexts([make_context(straight_road(2))]),
+        ...         "context": collate_contexts([make_context(straight_road(2), model.featurize)]),
         ...         "tokens": torch.full((1, 1, 2, 16), 84),
         ...         "token_valid": torch.ones(1, 1, 2, 16, dtype=torch.bool),
         ...     },
@@ -54,7 +56,7 @@ class NextTokenLoss(LossModule):
         """Keys of the input.
 
         Attributes:
-            context: :class:`~dpa.policy.SceneContext` of batch size ``[S]``.
+            context: :class:`~dpa.models.context.Context` of batch size ``[S]``.
             tokens: ``[S, M, A, T]`` int64, what the network reads.
             labels: ``[S, M, A, T]`` int64, what it is to predict; the tokens themselves by default.
             token_valid: ``[S, M or 1, A, T]`` bool; an agent is seen by others while its tokens are valid.

@@ -57,13 +57,15 @@ class PolicyGradientLoss(LossModule):
 
     Examples:
         >>> from dpa.losses import token_network
-        >>> from dpa.policy import MotionLM, collate_contexts, make_context
+        >>> from dpa.models import collate_contexts, make_context
+        >>> from dpa.models.motionlm import MotionLM
         >>> from dpa.tokens import VerletTokenizer
         >>> from envs.sources.synthetic import straight_road
-        >>> loss = PolicyGradientLoss(token_network(MotionLM("nano", VerletTokenizer())), kl=0.1)
+        >>> model = MotionLM("nano", VerletTokenizer())
+        >>> loss = PolicyGradientLoss(token_network(model), kl=0.1)
         >>> batch = TensorDict(
         ...     {
-        ...         "context": collate_contexts([make_context(straight_road(2))]),
+        ...         "context": collate_contexts([make_context(straight_road(2), model.featurize)]),
         ...         "tokens": torch.randint(169, (1, 4, 2, 16)),
         ...         "token_valid": torch.ones(1, 1, 2, 16, dtype=torch.bool),
         ...         "advantage": torch.tensor([1.0, -1.0, 0.5, -0.5])[None, :, None, None],
@@ -79,7 +81,7 @@ class PolicyGradientLoss(LossModule):
         """Keys of the input.
 
         Attributes:
-            context: :class:`~dpa.policy.SceneContext` of batch size ``[S]``.
+            context: :class:`~dpa.models.context.Context` of batch size ``[S]``.
             tokens: ``[S, K, A, T]`` int64.
             token_valid: ``[S, 1, A, T]`` bool.
             advantage: broadcastable to ``[S, K, A, T]``.

@@ -120,7 +120,8 @@ class PreferenceLoss(LossModule):
 
     Examples:
         >>> from dpa.losses import token_network
-        >>> from dpa.policy import MotionLM, collate_contexts, make_context
+        >>> from dpa.models import collate_contexts, make_context
+        >>> from dpa.models.motionlm import MotionLM
         >>> from dpa.tokens import VerletTokenizer
         >>> from envs.sources.synthetic import straight_road
         >>> class Difference(PreferenceLoss):
@@ -128,10 +129,11 @@ class PreferenceLoss(LossModule):
         ...     def compare(self, preferred, unpreferred, tensordict):
         ...         logit = preferred.score - unpreferred.score
         ...         return Comparison(-logit, logit, torch.ones_like(logit))
-        >>> loss = Difference(token_network(MotionLM("nano", VerletTokenizer())))
+        >>> model = MotionLM("nano", VerletTokenizer())
+        >>> loss = Difference(token_network(model))
         >>> batch = TensorDict(
         ...     {
-        ...         "context": collate_contexts([make_context(straight_road(2))]),
+        ...         "context": collate_contexts([make_context(straight_road(2), model.featurize)]),
         ...         "preferred": torch.full((1, 4, 2, 16), 84),
         ...         "unpreferred": torch.full((1, 4, 2, 16), 90),
         ...         "token_valid": torch.ones(1, 1, 2, 16, dtype=torch.bool),
@@ -148,7 +150,7 @@ class PreferenceLoss(LossModule):
         """Keys of the input.
 
         Attributes:
-            context: :class:`~dpa.policy.SceneContext` of batch size ``[S]``.
+            context: :class:`~dpa.models.context.Context` of batch size ``[S]``.
             preferred: ``[S, M, A, T]`` int64.
             unpreferred: ``[S, N, A, T]`` int64.
             token_valid: ``[S, 1, A, T]`` bool, the same for both sides.

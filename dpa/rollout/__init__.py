@@ -3,7 +3,7 @@
 from dpa.rollout.collector import RolloutCollector, make_collector
 from dpa.rollout.crew import Workers
 from dpa.rollout.job import RolloutJob, RolloutWorker, Subset
-from dpa.rollout.plan import RolloutTask, bytes_per_row, plan_tasks
+from dpa.rollout.plan import RolloutTask, plan_tasks
 from dpa.rollout.poses import lifted, simulated_poses
 
 __all__ = [
@@ -13,7 +13,6 @@ __all__ = [
     "RolloutWorker",
     "Subset",
     "Workers",
-    "bytes_per_row",
     "lifted",
     "make_collector",
     "plan_tasks",

@@ -13,15 +13,15 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.collectors import BaseCollector
 
-from dpa.policy.context import ContextOptions
-from dpa.policy.motionlm import MotionLM
-from dpa.policy.precision import Precision
-from dpa.policy.sampling import Decoding
+from dpa.models import MotionModel
+from dpa.models.precision import Precision
+from dpa.models.sampling import Decoding
 from dpa.rollout.crew import Crew, Outcome, Workers, hire
 from dpa.rollout.job import PostProcess, RolloutJob
-from dpa.rollout.plan import GIB, RolloutTask, bytes_per_row, plan_tasks
+from dpa.rollout.plan import COLLECTED_BYTES, GIB, RolloutTask, plan_tasks
+from envs.episode import EpisodeOptions
 from envs.participants import num_simulated
-from envs.scene import CURRENT_STEP, SceneSource
+from envs.scene import SceneSource
 
 MOST_LOSSES = 3
 """Workers that one task may cost before it is given up."""
@@ -227,13 +227,13 @@ class RolloutCollector(BaseCollector):
 
 def make_collector(
     scenes: SceneSource,
-    model: MotionLM,
+    model: MotionModel,
     *,
     num_rollouts: int,
     indices: Sequence[int] | None = None,
     done: Collection[int] = (),
     decoding: Decoding | None = None,
-    options: ContextOptions | None = None,
+    options: EpisodeOptions | None = None,
     seed: int = 0,
     make_postproc: Callable[[SceneSource], PostProcess] | None = None,
     workers: Workers | None = None,
@@ -256,14 +256,14 @@ def make_collector(
         indices: scenes to roll out; all by default.
         done: scenes that are not needed.
         decoding: how tokens are drawn.
-        options: how scenes are cut up; also the horizon and the controlled agents.
+        options: of the episodes.
         seed: of the sampling.
         make_postproc: makes the post-processing of some scenes' rollouts; it runs in the workers.
         workers: who does it; this process by default.
         memory: budget of each worker for rollouts [GiB]; a crowded scene is rolled out in pieces.
         device: of environment and policy.
         precision: of the policy's linear layers: ``"bfloat16"`` is for GPUs.
-        compile: the decoder, which pays for many scenes; see :class:`~dpa.policy.MotionActor`.
+        compile: the decoder, which pays for many scenes; see :class:`~dpa.models.MotionActor`.
 
     Examples:
         >>> from dpa.tokens import VerletTokenizer
@@ -276,7 +276,7 @@ def make_collector(
     """
     if num_rollouts < 1:
         raise ValueError(f"num_rollouts must be 1 or more, got {num_rollouts}.")
-    options = options or ContextOptions()
+    options = options or EpisodeOptions()
     job = RolloutJob(
         scenes,
         model,
@@ -289,28 +289,26 @@ def make_collector(
         precision=precision,
         compile=compile,
     )
-    tasks = plan_tasks(agents_of(scenes, indices, options), num_rollouts, rows_within(memory, model, options), done)
+    tasks = plan_tasks(agents_of(scenes, indices, options), num_rollouts, rows_within(memory, model), done)
     return RolloutCollector(job, tasks, workers)
 
 
-def rows_within(memory: float, model: MotionLM, options: ContextOptions) -> int:
+def rows_within(memory: float, model: MotionModel) -> int:
     """Agents times rollouts that run side by side within a budget [GiB].
 
     Raises:
         ValueError: the budget does not hold one agent.
     """
-    rows = int(memory * GIB) // bytes_per_row(model.config, options.max_pieces)
+    rows = int(memory * GIB) // (model.bytes_per_row() + model.config.horizon * COLLECTED_BYTES)
     if rows < 1:
         raise ValueError(f"memory must hold at least one agent, got {memory} GiB; give 0.1 or more.")
     return rows
 
 
-def agents_of(scenes: SceneSource, indices: Sequence[int] | None, options: ContextOptions) -> dict[int, int]:
+def agents_of(scenes: SceneSource, indices: Sequence[int] | None, options: EpisodeOptions) -> dict[int, int]:
     """Simulated agents of some scenes (all by default) by index; without arrivals a store knows them by itself."""
     wanted = range(len(scenes)) if indices is None else indices
     known = None if options.arrivals else getattr(scenes, "num_agents", None)
     if known is not None:
         return {i: int(known[i]) for i in wanted}
-    last = CURRENT_STEP + options.decision_steps * options.horizon
-    cast = {"arrivals": options.arrivals, "last_step": last}
-    return {i: num_simulated(scenes[i], **cast) for i in wanted}
+    return {i: num_simulated(scenes[i], **options.cast) for i in wanted}

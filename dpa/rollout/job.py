@@ -12,14 +12,13 @@ from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 
-from dpa.policy.actor import Contexts, MotionActor
-from dpa.policy.context import ContextOptions
-from dpa.policy.motionlm import MotionLM
-from dpa.policy.precision import Precision, check_precision
-from dpa.policy.sampling import Decoding
+from dpa.models import Contexts, MotionActor, MotionModel
+from dpa.models.precision import Precision, check_precision
+from dpa.models.sampling import Decoding
 from dpa.rollout.plan import RolloutTask
 from dpa.tokens import TokenAction
 from envs import keys
+from envs.episode import EpisodeOptions
 from envs.scene import Scene, SceneSource
 from envs.traffic import TrafficEnv
 
@@ -61,20 +60,20 @@ class RolloutJob:
         model: what drives.
         num_rollouts: K.
         decoding: how tokens are drawn.
-        options: how scenes are cut up; also the horizon and the controlled agents.
+        options: of the episodes.
         seed: of the sampling.
         make_postproc: makes the post-processing of a task from its scenes, for instance
             :class:`~dpa.ranking.transform.RankRollouts`; applied to the whole rollouts ``[S * K, T]`` of the task.
         device: of environment and policy.
-        precision: of the policy's linear layers, see :class:`~dpa.policy.MotionActor`.
-        compile: the decoder, see :class:`~dpa.policy.MotionActor`.
+        precision: of the policy's linear layers, see :class:`~dpa.models.MotionActor`.
+        compile: what decodes, see :class:`~dpa.models.MotionActor`.
     """
 
     scenes: SceneSource
-    model: MotionLM
+    model: MotionModel
     num_rollouts: int
     decoding: Decoding = field(default_factory=Decoding)
-    options: ContextOptions = field(default_factory=ContextOptions)
+    options: EpisodeOptions = field(default_factory=EpisodeOptions)
     seed: int = 0
     make_postproc: Callable[[SceneSource], PostProcess] | None = None
     device: torch.device | str = "cpu"
@@ -85,19 +84,9 @@ class RolloutJob:
         check_precision(self.precision)
 
 
-def make_env(part: Subset, options: ContextOptions, num_rollouts: int, device: str) -> TrafficEnv:
-    """The environment of some scenes side by side, for a policy that sees them as the options say."""
-    return TrafficEnv(
-        part,
-        num_scenes=len(part),
-        num_rollouts=num_rollouts,
-        control=options.control,
-        arrivals=options.arrivals,
-        max_controlled=options.max_controlled,
-        decision_steps=options.decision_steps,
-        horizon=options.horizon,
-        device=device,
-    )
+def make_env(part: Subset, options: EpisodeOptions, num_rollouts: int, device: str) -> TrafficEnv:
+    """The environment of some scenes side by side."""
+    return TrafficEnv(part, options, num_scenes=len(part), num_rollouts=num_rollouts, device=device)
 
 
 class RolloutWorker:
@@ -127,7 +116,7 @@ class RolloutWorker:
     def run(self, task: RolloutTask) -> TensorDictBase:
         """The rollouts of a task, post-processed; ``scene`` holds indices into the job's source."""
         part = Subset(self.job.scenes, task.scenes)
-        contexts = Contexts(part, self.job.options)
+        contexts = Contexts(part, self.model.featurize, self.job.options)
         pieces = [self._piece(part, contexts, piece) for piece in task.pieces]
         # [S * k, T] each; the rollouts of a scene must be contiguous.
         together = [piece.unflatten(0, (len(part), len(piece) // len(part))) for piece in pieces]

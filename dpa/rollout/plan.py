@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from dpa.policy.decoder import NEAREST_PIECES
-from dpa.policy.motionlm import MotionLMConfig
 from dpa.training.batches import micro_batches
 
 GIB = 1 << 30
-_COLLECTED_BYTES = 400
+COLLECTED_BYTES = 400
 """Of one agent and decision in a collector's batch: recent poses (now and next), action, token, flags, reward."""
-_FLOAT = 4
 
 
 @dataclass(frozen=True)
@@ -69,23 +66,3 @@ def _pieces(num_rollouts: int, most: int) -> Iterator[range]:
     count = -(-num_rollouts // most)
     for piece in range(count):
         yield range(piece * num_rollouts // count, (piece + 1) * num_rollouts // count)
-
-
-def bytes_per_row(config: MotionLMConfig, surroundings: int, itemsize: int = _FLOAT) -> int:
-    """Memory of one agent of one rollout while it runs: its cache, what a decision computes, and what is collected.
-
-    Args:
-        config: size of the model.
-        surroundings: map pieces and lights of a scene.
-        itemsize: bytes of a number in the model.
-
-    Examples:
-        >>> from dpa.policy import SIZES
-        >>> round(bytes_per_row(SIZES["paper"], surroundings=512) / 1024)
-        77
-    """
-    channels = config.width // config.heads + 3
-    cache = 2 * config.decoder_layers * config.heads * config.horizon * channels * itemsize
-    vicinity = 3 * NEAREST_PIECES * config.width * itemsize + 3 * surroundings * _FLOAT
-    layers = 4 * max(config.feed, 3 * config.width) * itemsize
-    return cache + vicinity + layers + config.horizon * _COLLECTED_BYTES

@@ -51,7 +51,7 @@ class TokenAction(Transform):
         if poses.shape[-2] != self.tokenizer.steps:
             raise ValueError(
                 f"The environment takes {poses.shape[-2]} poses for a decision and the tokenizer gives "
-                f"{self.tokenizer.steps}; set TrafficEnv(decision_steps={self.tokenizer.steps})."
+                f"{self.tokenizer.steps}; say EpisodeOptions(decision_steps={self.tokenizer.steps})."
             )
         del action[keys.ACTION]
         action[keys.TOKEN] = Categorical(

@@ -10,7 +10,8 @@ from tensordict import TensorDict
 from torch import Tensor
 from torch.nn import functional as F
 
-from dpa.policy.context import SceneContext, collate_contexts
+from dpa.models import collate_contexts
+from dpa.models.context import Context
 from envs import keys
 from envs.seeding import make_generator
 
@@ -25,7 +26,7 @@ class Item(NamedTuple):
         labels: ``[M, A, T]`` int64, what to predict where it is not the tokens themselves (noisy tokenization).
     """
 
-    context: SceneContext
+    context: Context
     tokens: Tensor
     token_valid: Tensor
     labels: Tensor | None = None

@@ -3,38 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from dpa.policy.context import ContextOptions, SceneContext, keep_agents, make_context
+from dpa.models import make_context
+from dpa.models.context import Context, Featurize, keep_agents, num_bytes
 from dpa.tokens.base import MotionTokenizer
 from dpa.training.batches import Item, with_tokens
 from envs.augment import Augmentation, Change
+from envs.episode import EpisodeOptions
 from envs.scene import Scene, SceneSource
 
 GIB = 1 << 30
 AS_LOGGED = Augmentation()
 
 
-def log_item(context: SceneContext, tokenizer: MotionTokenizer) -> Item:
+def log_item(context: Context, tokenizer: MotionTokenizer) -> Item:
     """The log of a scene as one rollout (M = 1).
 
     Examples:
-        >>> from dpa.policy import make_context
+        >>> from dpa.models import make_context
+        >>> from dpa.models.motionlm import featurize
         >>> from dpa.tokens import VerletTokenizer
         >>> from envs.sources.synthetic import straight_road
-        >>> log_item(make_context(straight_road(2)), VerletTokenizer()).tokens.shape
+        >>> log_item(make_context(straight_road(2), featurize), VerletTokenizer()).tokens.shape
         torch.Size([1, 2, 16])
     """
     return log_items([context], tokenizer)[0]
 
 
 def log_items(
-    contexts: Sequence[SceneContext],
+    contexts: Sequence[Context],
     tokenizer: MotionTokenizer,
     *,
     noise: float = 0.0,
@@ -54,17 +56,17 @@ def log_items(
     """
 
     def padded(name: str) -> Tensor:
-        return pad_sequence([getattr(context, name) for context in contexts], batch_first=True)
+        return pad_sequence([getattr(context.episode, name) for context in contexts], batch_first=True)
 
     given = (padded(name) for name in ("logged", "logged_valid", "recent", "kind"))
     draws = pad_sequence(list(drawn), batch_first=True) if drawn is not None else None
     tracks = tokenizer.encode_tracks(*given, noise=noise, recovery=recovery, drawn=draws)
     rows = zip(contexts, tracks.tokens, tracks.labels, tracks.valid, strict=True)
-    return [_item(context, *(row[: len(context.kind)] for row in each)) for context, *each in rows]
+    return [_item(context, *(row[: len(context.episode.kind)] for row in each)) for context, *each in rows]
 
 
-def _item(context: SceneContext, tokens: Tensor, labels: Tensor, valid: Tensor) -> Item:
-    return Item(context, tokens[None], valid & context.controlled[:, None], labels[None])
+def _item(context: Context, tokens: Tensor, labels: Tensor, valid: Tensor) -> Item:
+    return Item(context, tokens[None], valid & context.episode.controlled[:, None], labels[None])
 
 
 class Drawn(NamedTuple):
@@ -78,7 +80,7 @@ class Drawn(NamedTuple):
     """
 
     key: tuple[int, bool] | None
-    log: Item | SceneContext
+    log: Item | Context
     chosen: Tensor | None
     noise: Tensor | None
 
@@ -92,7 +94,8 @@ class LogItems:
     Args:
         scenes: a store or a list.
         tokenizer: on the CPU.
-        options: of :func:`~dpa.policy.make_context`.
+        featurize: what a policy sees of them.
+        options: of their episodes.
 
     Keyword Args:
         augment: drawn anew each time that a scene comes up.
@@ -105,7 +108,7 @@ class LogItems:
         >>> from dpa.tokens import VerletTokenizer
         >>> from envs.loader import SceneLoader
         >>> from envs.sources.synthetic import straight_road
-        >>> logs = LogItems([straight_road(3)], VerletTokenizer(), ContextOptions(), max_agents=2)
+        >>> logs = LogItems([straight_road(3)], VerletTokenizer(), featurize, EpisodeOptions(), max_agents=2)
         >>> loader = SceneLoader(logs, batch_size=1, prepare=logs.prepare, collate=logs.collate)
         >>> [item.tokens.shape for item in next(iter(loader))]
         [torch.Size([1, 2, 16])]
@@ -115,7 +118,8 @@ class LogItems:
         self,
         scenes: SceneSource,
         tokenizer: MotionTokenizer,
-        options: ContextOptions,
+        featurize: Featurize,
+        options: EpisodeOptions,
         *,
         augment: Augmentation = AS_LOGGED,
         noise: float = 0.0,
@@ -123,7 +127,7 @@ class LogItems:
         max_agents: int,
         keep_gib: float = 0.0,
     ) -> None:
-        self.scenes, self.tokenizer, self.options = scenes, tokenizer, options
+        self.scenes, self.tokenizer, self.featurize, self.options = scenes, tokenizer, featurize, options
         self.augment, self.max_agents = augment, max_agents
         self.noise, self.recovery = noise, recovery
         self.keep_gib = keep_gib
@@ -154,7 +158,7 @@ class LogItems:
         log = self._kept[key] if key in self._kept else self._context(index, scene, change)
         context = log.context if isinstance(log, Item) else log
         chosen = choose_agents(context, self.max_agents, generator)
-        shape = (len(context.kind if chosen is None else chosen), self.options.horizon, 3)
+        shape = (len(context.episode.kind if chosen is None else chosen), self.options.horizon, 3)
         return Drawn(key, log, chosen, torch.rand(shape, generator=generator) if self.noise else None)
 
     def collate(self, drawn: Sequence[Drawn]) -> list[Item]:
@@ -169,8 +173,8 @@ class LogItems:
             items = log_items(contexts, self.tokenizer, noise=self.noise, recovery=self.recovery, drawn=noise)
         return with_tokens(items)
 
-    def _context(self, index: int, scene: Scene | None, change: Change) -> SceneContext:
-        return make_context(change(self.scenes[index] if scene is None else scene), self.options)
+    def _context(self, index: int, scene: Scene | None, change: Change) -> Context:
+        return make_context(change(self.scenes[index] if scene is None else scene), self.featurize, self.options)
 
     def _keep(self, key: tuple[int, bool] | None, item: Item) -> Item:
         if key is not None and key not in self._kept and self._bytes < self.keep_gib * GIB:
@@ -185,16 +189,16 @@ class LogItems:
         return self.__dict__ | {"_kept": {}, "_agents": {}, "_bytes": 0}
 
 
-def choose_agents(context: SceneContext, limit: int, generator: torch.Generator) -> Tensor | None:
+def choose_agents(context: Context, limit: int, generator: torch.Generator) -> Tensor | None:
     """``[n]`` indices of the ``limit`` agents nearest to a random one, to bound the cost of a crowded scene.
 
     Returns:
         None where all are few enough; nothing is drawn then.
     """
-    count = len(context.kind)
+    count = len(context.episode.kind)
     if count <= limit:
         return None
-    xy = context.recent[:, -1, :2]
+    xy = context.episode.recent[:, -1, :2]
     centre = xy[torch.randint(count, (), generator=generator)]
     return (xy - centre).norm(dim=-1).argsort(stable=True)[:limit].sort().values
 
@@ -208,5 +212,4 @@ def _of_agents(item: Item, chosen: Tensor | None) -> Item:
 
 
 def _bytes_of(item: Item) -> int:
-    tensors = [getattr(item.context, field.name) for field in fields(SceneContext)] + list(item[1:])
-    return sum(tensor.numel() * tensor.element_size() for tensor in tensors)
+    return num_bytes(item.context) + sum(tensor.numel() * tensor.element_size() for tensor in item[1:])

@@ -12,8 +12,8 @@ from omegaconf import DictConfig
 from tensordict import TensorDict
 from torch import Tensor
 
-from dpa.policy import ContextOptions, SceneContext
-from dpa.policy.actor import Contexts
+from dpa.models import Contexts
+from dpa.models.context import Context
 from dpa.preferences import (
     PreferenceStore,
     agent_preference,
@@ -28,7 +28,6 @@ from dpa.preferences import (
 from dpa.tokens import MotionTokenizer
 from dpa.training.logs import log_item
 from envs import keys
-from envs.scene import SceneSource
 from envs.seeding import make_generator
 from recipes.alignment.data import PAIRED, RANKED, SIDES, check_data
 
@@ -46,7 +45,7 @@ class Group(NamedTuple):
         sides: how the two sides belong together, one of the values of :data:`~recipes.alignment.data.SIDES`.
     """
 
-    context: SceneContext
+    context: Context
     preferred: Tensor
     unpreferred: Tensor | None
     token_valid: Tensor
@@ -64,8 +63,7 @@ class Chosen(NamedTuple):
 def make_candidates(
     data: DictConfig,
     store: PreferenceStore,
-    scenes: SceneSource,
-    options: ContextOptions,
+    contexts: Contexts,
     tokenizer: MotionTokenizer,
     seed: int,
     expert: PreferenceStore | None = None,
@@ -84,8 +82,7 @@ def make_candidates(
             - sets: ``num`` nearest rollouts against ``num_unpreferred`` farthest ones;
             - ranking: ``num`` rollouts spread evenly over the ranks, None for all.
         store: ranked rollouts.
-        scenes: that they are of.
-        options: how scenes are cut up.
+        contexts: of the scenes that they are of.
         tokenizer: for the tokens of logs.
         seed: of everything that is drawn.
         expert: rollouts of an expert in the same scenes and tokens, the preferred side of ``kind: expert``.
@@ -110,7 +107,7 @@ def make_candidates(
     rows = [row for row, scene in enumerate(store.scenes.tolist()) if scene in wanted]
     chosen = zip(rows, _choose(data, store, rows, seed), strict=True)
     left = {row: each for row, each in chosen if len(each.preferred)}
-    candidates = Candidates(data, store, left, Contexts(scenes, options), tokenizer, seed, expert)
+    candidates = Candidates(data, store, left, contexts, tokenizer, seed, expert)
     if not any(group.token_valid.any() for group in candidates):
         raise ValueError(
             f"none of the {len(rows)} scenes of {store.folder} has anything to learn from; raise "
@@ -148,7 +145,7 @@ class Candidates(Sequence[Group]):
         row = self._rows[index]
         scene = int(self.store.scenes[row])
         context = self.contexts[scene]
-        agents = len(context.kind)
+        agents = len(context.episode.kind)
         group = group_of(self.data, context, self.store.read([row], num_agents=agents)[0], self.chosen[row])
         if self.data.kind == "adversarial":
             log = log_item(context, self.tokenizer)
@@ -170,7 +167,7 @@ class Candidates(Sequence[Group]):
         return {len(each.preferred) for each in self.chosen.values()}
 
 
-def group_of(data: DictConfig, context: SceneContext, ranked: TensorDict, chosen: Chosen) -> Group:
+def group_of(data: DictConfig, context: Context, ranked: TensorDict, chosen: Chosen) -> Group:
     """Chosen rollouts of one scene's own ranked group, which is cut to its own agents."""
     tokens, valid, say = ranked[keys.TOKENS], ranked[keys.TOKEN_VALID], None
     # Displacement is kept of rollouts as a whole: agents have a preference by the distance only.

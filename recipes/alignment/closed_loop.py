@@ -11,16 +11,15 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from dpa.losses.network import without_dropout
-from dpa.policy import ContextOptions, MotionLM
-from dpa.policy.actor import Contexts
-from dpa.policy.closest import ClosestActor
-from dpa.policy.context import collate_contexts
+from dpa.models import Contexts, MotionModel, collate_contexts
+from dpa.models.closest import ClosestActor
 from dpa.rollout.job import Subset, make_env
 from dpa.tokens import TokenAction
 from dpa.training.batches import ShuffledOrder, micro_batches
 from dpa.training.distributed import ALONE, Ranks
 from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
 from envs import keys
+from envs.episode import EpisodeOptions
 from envs.scene import SceneSource
 
 
@@ -35,7 +34,7 @@ class ClosedLoopStep:
         loss: of a batch, with ``labels`` and ``learnt``; a loss module, or what the ranks wrapped it into.
         scenes: to learn from.
         context: how they are cut up.
-        follow: ``candidates`` and ``recovery`` of :class:`~dpa.policy.closest.ClosestActor`.
+        follow: ``candidates`` and ``recovery`` of :class:`~dpa.models.closest.ClosestActor`.
         options: the section ``alignment``.
         seed: of the order of scenes.
         device: of rollouts and batches.
@@ -48,17 +47,18 @@ class ClosedLoopStep:
 
     def __init__(
         self,
-        model: MotionLM,
+        model: MotionModel,
         loss: Callable[[TensorDictBase], TensorDictBase],
         scenes: SceneSource,
-        context: ContextOptions,
+        episode: EpisodeOptions,
         follow: dict[str, float],
         options: DictConfig,
         seed: int,
         device: str,
         ranks: Ranks = ALONE,
     ) -> None:
-        self.model, self.loss, self.scenes, self.contexts = model, loss, scenes, Contexts(scenes, context)
+        self.model, self.loss, self.scenes = model, loss, scenes
+        self.contexts = Contexts(scenes, model.featurize, episode)
         self.follow, self.options, self.device, self.ranks = follow, options, device, ranks
         self.optimizer = make_optimizer(model, options.lr, options.weight_decay)
         self.schedule = make_schedule(self.optimizer, options.steps, options.warmup)
@@ -103,8 +103,8 @@ class ClosedLoopStep:
     def _parts(self, indices: Sequence[int], followed: TensorDict, learnt: float) -> Iterator[tuple[TensorDict, float]]:
         """Scenes of similar size as batches, each with its share of the labels of all ranks."""
         contexts = [self.contexts[index] for index in indices]
-        for rows in micro_batches([len(context.kind) for context in contexts], self.options.max_rows):
-            agents = max(len(contexts[row].kind) for row in rows)
+        for rows in micro_batches([len(context.episode.kind) for context in contexts], self.options.max_rows):
+            agents = max(len(contexts[row].episode.kind) for row in rows)
             batch = TensorDict(
                 {key: value[rows, :, :agents] for key, value in followed.items()}, batch_size=[len(rows)]
             )

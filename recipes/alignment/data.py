@@ -6,7 +6,7 @@ from typing import get_args
 
 from omegaconf import DictConfig, OmegaConf
 
-from dpa.policy import Decoding
+from dpa.models import Decoding
 from dpa.ranking import Distance
 from dpa.rewards import Baseline, Scale, check_rewards
 from envs import keys

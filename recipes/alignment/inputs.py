@@ -9,8 +9,9 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from dpa.policy import ContextOptions, MotionLM
+from dpa.models import Contexts, MotionModel
 from dpa.preferences import PreferenceStore
+from envs.episode import EpisodeOptions
 from envs.progress import message
 from envs.store import SceneStore
 from recipes.alignment.candidates import Candidates, make_candidates
@@ -34,7 +35,7 @@ class Inputs:
 
     Attributes:
         model: to align, without dropout.
-        context: how scenes are cut up for it.
+        episode: options of its episodes.
         config: of the model, as its file has it.
         scenes: that the rollouts are of.
         store: of the rollouts; None for a method that makes its own in every step.
@@ -42,8 +43,8 @@ class Inputs:
         learnt: indices of the scenes to learn from.
     """
 
-    model: MotionLM
-    context: ContextOptions
+    model: MotionModel
+    episode: EpisodeOptions
     config: dict[str, Any]
     scenes: SceneStore
     store: PreferenceStore | None
@@ -74,10 +75,10 @@ class Inputs:
         Raises:
             ValueError: preferences of other scenes or of another policy, or that lack a scene of ``among``.
         """
-        model, context, config = open_policy(policy, device)
+        model, episode, config = open_policy(policy, device)
         if preferences is None:
             everything = list(range(len(scenes)))
-            return cls(model, context, config, scenes, None, None, everything if among is None else sorted(among))
+            return cls(model, episode, config, scenes, None, None, everything if among is None else sorted(among))
         store = open_preferences(preferences, scenes, model, policy)
         ranked = set(store.scenes.tolist())
         learnt = sorted(ranked if among is None else among)
@@ -88,7 +89,7 @@ class Inputs:
             )
         if among is None and len(learnt) < len(scenes):
             message(f"{preferences} holds {len(learnt)} of {len(scenes)} scenes; only these are learnt from.")
-        return cls(model, context, config, scenes, store, None if expert is None else PreferenceStore(expert), learnt)
+        return cls(model, episode, config, scenes, store, None if expert is None else PreferenceStore(expert), learnt)
 
     def deciding(self, method: DictConfig, alignment: DictConfig, seed: int) -> dict[str, Any]:
         """All that decides what becomes of the policy: a run with the same goes on, or is finished.
@@ -113,7 +114,8 @@ class Inputs:
     def candidates(self, data: DictConfig, seed: int) -> Candidates:
         """See :func:`~recipes.alignment.candidates.make_candidates`."""
         tokenizer = self.model.tokenizer.on_cpu()
-        return make_candidates(data, self.store, self.scenes, self.context, tokenizer, seed, self.expert, self.learnt)
+        contexts = Contexts(self.scenes, self.model.featurize, self.episode)
+        return make_candidates(data, self.store, contexts, tokenizer, seed, self.expert, self.learnt)
 
     def looks(self, data: DictConfig, alignment: DictConfig, watch: Watch | None) -> list[Look | ImitationLook]:
         """What is looked at along the way: what no loss sees, and what a method that imitates does not see.
@@ -126,9 +128,9 @@ class Inputs:
         looks: list[Look | ImitationLook] = []
         if watch is not None:
             provenance = None if self.store is None else self.store.provenance
-            looks.append(Look(watch, self.context, self.model, alignment, provenance))
+            looks.append(Look(watch, self.episode, self.model, alignment, provenance))
         if self.store is not None and SIDES[data.kind] == "targets" and self.store.provenance.num_rollouts > 1:
             looks.append(
-                ImitationLook(self.store, self.scenes, self.context, self.model, alignment, data.rank_by, self.learnt)
+                ImitationLook(self.store, self.scenes, self.episode, self.model, alignment, data.rank_by, self.learnt)
             )
         return looks

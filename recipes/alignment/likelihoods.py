@@ -10,13 +10,14 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from dpa.losses.network import token_divergence, token_entropy, token_log_prob
-from dpa.policy import ContextOptions, Decoding, MotionLM, SceneContext, collate_contexts
-from dpa.policy.actor import Contexts
+from dpa.models import Contexts, Decoding, MotionModel, collate_contexts
+from dpa.models.context import Context
 from dpa.preferences import PreferenceStore, nearest_farthest
 from dpa.rollout import make_collector
 from dpa.tokens import MotionTokenizer
 from dpa.training.logs import log_item
 from envs import keys
+from envs.episode import EpisodeOptions
 from envs.scene import SceneSource
 
 PROBED = (
@@ -39,7 +40,7 @@ class Probe(NamedTuple):
         valid: ``[A, T]`` bool, of the rollouts.
     """
 
-    context: SceneContext
+    context: Context
     demonstration: Tensor
     demonstration_valid: Tensor
     preferred: Tensor
@@ -49,8 +50,7 @@ class Probe(NamedTuple):
 
 def make_probes(
     store: PreferenceStore,
-    scenes: SceneSource,
-    options: ContextOptions,
+    contexts: Contexts,
     tokenizer: MotionTokenizer,
     pairs: int,
     rows: Iterable[int] | None = None,
@@ -60,25 +60,25 @@ def make_probes(
 
     Args:
         store: of rollouts, ranked by the distance that is asked about.
-        scenes: that it is of.
-        options: how scenes are cut up.
+        contexts: of the scenes that it is of; each is asked for once.
         tokenizer: of logs.
         pairs: M, at most half of the rollouts of a scene.
         rows: of the store; all by default.
         rank_by: ``distance`` or ``ade``, which decides what is near.
     """
-    contexts = Contexts(scenes, options, most=1)  # each is asked about once
     near, far = nearest_farthest(store.distance if rank_by == keys.DISTANCE else store.ade, pairs)
     for row in range(len(store)) if rows is None else rows:
         context = contexts[int(store.scenes[row])]
-        group = store.read([row], num_agents=len(context.kind))[0]
+        group = store.read([row], num_agents=len(context.episode.kind))[0]
         log, tokens = log_item(context, tokenizer), group[keys.TOKENS]
         sides = tokens[near[row]], tokens[far[row]]
         yield Probe(context, log.tokens[0], log.token_valid, *sides, group[keys.TOKEN_VALID])
 
 
 @torch.no_grad()
-def probe(model: MotionLM, reference: MotionLM, probes: Iterable[Probe], device: str = "cpu") -> list[dict[str, float]]:
+def probe(
+    model: MotionModel, reference: MotionModel, probes: Iterable[Probe], device: str = "cpu"
+) -> list[dict[str, float]]:
     """Ask a policy about each probe.
 
     Args:
@@ -98,7 +98,7 @@ def probe(model: MotionLM, reference: MotionLM, probes: Iterable[Probe], device:
 
 
 @torch.no_grad()
-def probe_sides(model: MotionLM, probes: Iterable[Probe], device: str = "cpu") -> list[dict[str, float]]:
+def probe_sides(model: MotionModel, probes: Iterable[Probe], device: str = "cpu") -> list[dict[str, float]]:
     """Ask a policy about the rollouts of each probe alone: one pass, and none of a reference.
 
     Args:
@@ -117,7 +117,7 @@ def probe_sides(model: MotionLM, probes: Iterable[Probe], device: str = "cpu") -
     return found
 
 
-def _rollouts(each: Probe, device: str) -> tuple[SceneContext, Tensor, Tensor]:
+def _rollouts(each: Probe, device: str) -> tuple[Context, Tensor, Tensor]:
     """Context, tokens ``[1, 2 * M, A, T]`` and validity ``[1, 1, A, T]``, the preferred rollouts first."""
     tokens = torch.cat((each.preferred, each.unpreferred))[None]
     return collate_contexts([each.context]).to(device), tokens.to(device), each.valid[None, None].to(device)
@@ -143,7 +143,7 @@ def _share_above(near: Tensor, far: Tensor, valid: Tensor, tie: float = 0.0) -> 
     return share if valid.any() else torch.full_like(share, torch.nan)
 
 
-def _probed(model: MotionLM, reference: MotionLM, each: Probe, device: str) -> dict[str, float]:
+def _probed(model: MotionModel, reference: MotionModel, each: Probe, device: str) -> dict[str, float]:
     context, tokens, valid = _rollouts(each, device)
     logits, before = (policy(context, tokens, valid) for policy in (model, reference))
     now, then = (_log_prob(seen, tokens, valid) for seen in (logits, before))
@@ -165,10 +165,10 @@ def _mean(value: Tensor, valid: Tensor) -> Tensor:
 
 
 def divergence(
-    model: MotionLM,
-    reference: MotionLM,
+    model: MotionModel,
+    reference: MotionModel,
     scenes: SceneSource,
-    options: ContextOptions,
+    options: EpisodeOptions,
     *,
     num_rollouts: int,
     seed: int,
@@ -184,13 +184,13 @@ def divergence(
         model: aligned policy.
         reference: policy that it started from.
         scenes: to roll out.
-        options: how they are cut up.
+        options: of their episodes.
         num_rollouts: of each scene.
         seed: of the rollouts.
         memory: GiB for rollouts.
         device: of both.
     """
-    contexts = Contexts(scenes, options, most=1)  # each is asked about once
+    contexts = Contexts(scenes, model.featurize, options, most=1)  # each is asked about once
     batches = make_collector(
         scenes,
         model,
@@ -215,8 +215,8 @@ def _groups(batches: Iterable[TensorDictBase], num_rollouts: int) -> Iterator[tu
 
 
 @torch.no_grad()
-def _kl(model: MotionLM, reference: MotionLM, context: SceneContext, tokens: Tensor, controlled: Tensor) -> float:
-    num_agents = len(context.kind)
+def _kl(model: MotionModel, reference: MotionModel, context: Context, tokens: Tensor, controlled: Tensor) -> float:
+    num_agents = len(context.episode.kind)
     tokens, controlled = tokens[None, :, :num_agents], controlled[:num_agents]
     valid = controlled[None, None, :, None].expand(1, 1, -1, tokens.shape[-1])
     context = collate_contexts([context]).to(tokens.device)

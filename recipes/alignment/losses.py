@@ -13,7 +13,7 @@ from dpa.losses import (
     PolicyGradientLoss,
     token_network,
 )
-from dpa.policy import MotionLM
+from dpa.models import MotionModel
 from envs import keys
 from recipes.alignment.data import PAIRED, SIDES, num_candidates
 from recipes.alignment.draws import num_drawn
@@ -37,7 +37,7 @@ FITS = {
 """What a loss can read, by its ``sides``: pairs may be read as two sets."""
 
 
-def make_loss(section: DictConfig, model: MotionLM) -> LossModule:
+def make_loss(section: DictConfig, model: MotionModel) -> LossModule:
     """The loss that a method names, around the model; a reference copy is the model as it is now."""
     options = {key: value for key, value in section.items() if key != "kind"}
     if section.kind not in LOSSES:

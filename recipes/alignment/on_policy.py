@@ -14,8 +14,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
-from dpa.policy import ContextOptions, MotionLM, SceneContext
-from dpa.policy.actor import Contexts
+from dpa.models import Contexts, MotionModel
+from dpa.models.context import Context
 from dpa.preferences import nearest_farthest
 from dpa.rewards import REWARDS, RewardRollouts, advantages, check_horizon
 from dpa.rollout import RolloutCollector, RolloutJob, RolloutTask, Workers, plan_tasks
@@ -24,6 +24,7 @@ from dpa.training.batches import Item, ShuffledOrder, collate_items, micro_batch
 from dpa.training.distributed import ALONE, Ranks
 from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
 from envs import keys
+from envs.episode import EpisodeOptions
 from envs.scene import SceneSource
 from envs.seeding import make_generator
 from recipes.alignment.candidates import Chosen, Group, group_of, pair_up
@@ -47,7 +48,7 @@ class Rolled(NamedTuple):
     """
 
     scene: int
-    context: SceneContext
+    context: Context
     ranked: TensorDict
     staleness: int
 
@@ -88,10 +89,10 @@ class OnPolicyStep:
 
     def __init__(
         self,
-        model: MotionLM,
+        model: MotionModel,
         loss: Callable[[TensorDictBase], TensorDictBase],
         scenes: SceneSource,
-        context: ContextOptions,
+        episode: EpisodeOptions,
         data: DictConfig,
         options: DictConfig,
         seed: int,
@@ -99,23 +100,24 @@ class OnPolicyStep:
         ranks: Ranks = ALONE,
     ) -> None:
         self.data, self.options, self.seed = check_data(data, 0), options, seed
-        self.loss, self.contexts, self.device, self.ranks = loss, Contexts(scenes, context), device, ranks
+        self.loss, self.device, self.ranks = loss, device, ranks
+        self.contexts = Contexts(scenes, model.featurize, episode)
         self.passes, self.rewards = data.get("passes", 1), rewards_of(data)
         self.optimizer = make_optimizer(model, options.lr, options.weight_decay)
         self.schedule = make_schedule(self.optimizer, self.passes * options.steps, self.passes * options.warmup)
         self.order = ShuffledOrder(len(scenes), options.scenes_per_step, seed)
         self.workers = build(Workers, options.workers, "alignment.workers")
-        self.most, self.sizes = rows_within(options.memory, model, context), partial(agents_of, scenes, options=context)
+        self.most, self.sizes = rows_within(options.memory, model), partial(agents_of, scenes, options=episode)
         decoding, distance = check_rolling(data)
         self.ranked_by = "missed" if data.ranking.get("kind") == "realism" else "distance"
-        check_horizon(self.rewards, context.decision_steps * context.horizon)
+        check_horizon(self.rewards, episode.steps)
         paid = {name: REWARDS[name] for name in self.rewards}
         job = RolloutJob(
             scenes,
             model,
             data.num_rollouts,
             decoding=decoding,
-            options=context,
+            options=episode,
             seed=seed,
             make_postproc=partial(RewardRollouts, num_rollouts=data.num_rollouts, distance=distance, rewards=paid),
             device=device,
@@ -180,7 +182,7 @@ class OnPolicyStep:
         context = self.contexts[scene]
         rewards = {(keys.REWARDS, name): -2 for name in self.rewards}
         for key, agents in (OF_AGENTS | rewards).items():
-            ranked[key] = ranked[key].narrow(agents, 0, len(context.kind))
+            ranked[key] = ranked[key].narrow(agents, 0, len(context.episode.kind))
         return Rolled(scene, context, ranked, self.collector.staleness)
 
     def _told(self, rolled: list[Rolled]) -> dict[str, float]:

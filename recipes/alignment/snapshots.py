@@ -9,7 +9,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from dpa.policy import MotionLM
+from dpa.models import MotionModel
 from recipes.common.models import write_policy
 
 
@@ -49,7 +49,7 @@ class Snapshots:
                     "asks for; remove that folder to train it again, or leave the snapshot out."
                 )
 
-    def keep(self, done: int, model: MotionLM, config: dict[str, Any], described: dict[str, Any]) -> None:
+    def keep(self, done: int, model: MotionModel, config: dict[str, Any], described: dict[str, Any]) -> None:
         """Write the policy if one of these steps is done; arguments are those of :func:`write_policy`."""
         if done in self.files:
             write_policy(self.files[done], model, config, {**described, "step": done})

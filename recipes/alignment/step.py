@@ -8,7 +8,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from dpa.policy import MotionLM
+from dpa.models import MotionModel
 from dpa.training.batches import ShuffledOrder, with_tokens
 from dpa.training.distributed import ALONE, Ranks
 from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
@@ -42,7 +42,7 @@ class AlignmentStep:
 
     def __init__(
         self,
-        model: MotionLM,
+        model: MotionModel,
         loss: Callable[[TensorDictBase], TensorDictBase],
         candidates: Candidates,
         options: DictConfig,

@@ -11,8 +11,9 @@ from numpy import nanmean
 from omegaconf import DictConfig
 
 from dpa.losses.network import without_dropout
-from dpa.policy import ContextOptions, MotionLM
+from dpa.models import Contexts, MotionModel
 from dpa.preferences import PreferenceStore, Provenance
+from envs.episode import EpisodeOptions
 from envs.store import SceneStore
 from recipes.alignment.likelihoods import PROBED, SIDED, make_probes, probe, probe_sides
 from recipes.common.models import open_policy
@@ -39,7 +40,7 @@ class Look:
 
     Args:
         watch: the scenes.
-        context: how scenes are cut up.
+        episode: options of their episodes.
         model: in training.
         options: the section ``alignment``.
         learnt_from: origin of the rollouts that the training learns from, if it learns from such.
@@ -51,8 +52,8 @@ class Look:
     def __init__(
         self,
         watch: Watch,
-        context: ContextOptions,
-        model: MotionLM,
+        episode: EpisodeOptions,
+        model: MotionModel,
         options: DictConfig,
         learnt_from: Provenance | None,
     ) -> None:
@@ -72,7 +73,8 @@ class Look:
         rows = range(min(options.watch_scenes, len(store)))
         pairs = min(options.watch_pairs, store.provenance.num_rollouts // 2)
         tokenizer = model.tokenizer.on_cpu()
-        self.probes = list(make_probes(store, watch.scenes, context, tokenizer, pairs, rows))
+        contexts = Contexts(watch.scenes, model.featurize, episode, most=1)
+        self.probes = list(make_probes(store, contexts, tokenizer, pairs, rows))
         reference, _, _ = open_policy(watch.reference)
         self.model, self.reference = model, reference.to(next(model.parameters()).device)
 
@@ -91,7 +93,7 @@ class ImitationLook:
     Args:
         store: of the rollouts, two or more of each scene.
         scenes: that it is of.
-        context: how scenes are cut up.
+        episode: options of their episodes.
         model: in training.
         options: the section ``alignment``.
         rank_by: ``distance`` or ``ade``, by which the method ranks.
@@ -102,8 +104,8 @@ class ImitationLook:
         self,
         store: PreferenceStore,
         scenes: SceneStore,
-        context: ContextOptions,
-        model: MotionLM,
+        episode: EpisodeOptions,
+        model: MotionModel,
         options: DictConfig,
         rank_by: str,
         learnt: Collection[int],
@@ -113,7 +115,8 @@ class ImitationLook:
         pairs = min(options.watch_pairs, store.provenance.num_rollouts // 2)
         tokenizer = model.tokenizer.on_cpu()
         kept = list(islice(rows, options.watch_scenes))
-        self.probes = list(make_probes(store, scenes, context, tokenizer, pairs, kept, rank_by))
+        contexts = Contexts(scenes, model.featurize, episode, most=1)
+        self.probes = list(make_probes(store, contexts, tokenizer, pairs, kept, rank_by))
         self.model = model
 
     def __call__(self, device: str) -> dict[str, float]:

@@ -25,13 +25,12 @@ from torch.utils.flop_counter import FlopCounterMode
 from torchrl.envs import TransformedEnv
 
 from dpa.losses import NextTokenLoss, token_network
-from dpa.policy import SIZES, Decoding, MotionActor, MotionLM
-from dpa.policy.actor import Contexts, pad_context
-from dpa.policy.context import collate_contexts, make_context
+from dpa.models import Contexts, Decoding, MotionActor, MotionModel, collate_contexts, make_context
+from dpa.models.context import pad_context
 from dpa.ranking.transform import RankRollouts
 from dpa.rollout import RolloutTask, RolloutWorker
 from dpa.rollout.job import RolloutJob
-from dpa.tokens import TokenAction, VerletTokenizer
+from dpa.tokens import TokenAction
 from dpa.training.batches import collate_items
 from dpa.training.logs import log_item
 from envs import keys
@@ -40,6 +39,7 @@ from envs.progress import progress
 from envs.scene import Scene
 from envs.traffic import TrafficEnv
 from recipes.benchmark.realism import crowded_scene
+from recipes.common.models import named_model, named_models
 
 KIB_PER_GIB = 1 << 20
 SEGMENTS = 5000
@@ -62,7 +62,7 @@ class Case:
         agents: of each scene, all controlled.
         rollouts: of each scene.
         scenes: side by side.
-        size: of the model.
+        model: name of its YAML.
         threads: of torch.
         repeats: episodes; the median counts.
         device: where model and environment are.
@@ -72,7 +72,7 @@ class Case:
     agents: int
     rollouts: int
     scenes: int
-    size: str
+    model: str
     threads: int
     repeats: int
     device: str
@@ -103,10 +103,11 @@ class UncachedActor(MotionActor):
         rows = scene[:: self.sharing].tolist()
         context = pad_context(collate_contexts([self.contexts[i] for i in rows]), self._taken.shape[1]).to(scene.device)
         steps = self.model.tokenizer.steps * (step + 1)
-        context = context.clone(recurse=False)
-        context.logged, context.logged_valid = context.logged[:, :, :steps], context.logged_valid[:, :, :steps]
+        context, episode = context.clone(recurse=False), context.episode.clone(recurse=False)
+        episode.logged, episode.logged_valid = episode.logged[:, :, :steps], episode.logged_valid[:, :, :steps]
+        context.episode = episode
         tokens = self._taken[..., : step + 1].unflatten(0, (len(rows), -1))
-        valid = context.controlled[:, None, :, None].expand(-1, 1, -1, step + 1)
+        valid = episode.controlled[:, None, :, None].expand(-1, 1, -1, step + 1)
         return self.model(context, tokens, valid)[..., -1, :].flatten(0, 1)
 
 
@@ -118,7 +119,7 @@ class NaiveActor(UncachedActor):
 
 def add_options(part: argparse.ArgumentParser) -> None:
     """Options of ``python -m recipes.benchmark rollout``."""
-    part.add_argument("--size", choices=sorted(SIZES), default="paper", help="of the model (default: %(default)s)")
+    part.add_argument("--model", choices=named_models(), default="paper", help="the policy (default: %(default)s)")
     part.add_argument("--agents", type=int, default=32, help="of a scene (default: %(default)s)")
     part.add_argument("--rollouts", type=int, default=32, help="of a scene (default: %(default)s)")
     part.add_argument("--scenes", type=int, default=1, help="side by side (default: %(default)s)")
@@ -144,7 +145,7 @@ def measure(options: dict[str, Any]) -> list[dict[str, Any]]:
     cases += [replace(main, how="trained", scenes=TRAINED_SCENES)]
     grown = sweep(main) if options["sweep"] else []
     rows = [asdict(case) | _apart(case) for case in progress([*cases, *grown], "rollout", unit="case")]
-    _print(rows[: len(cases)], f"rollouts, {main.size} model, {main.device}, {main.threads} threads")
+    _print(rows[: len(cases)], f"rollouts, {main.model} model, {main.device}, {main.threads} threads")
     if grown:
         _print(rows[len(cases) :], "growth")
     limit = _limit(main, rows[0])
@@ -168,7 +169,7 @@ def run(case: Case) -> dict[str, float]:
     torch.set_num_threads(case.threads)
     keep_freed_memory()
     torch.manual_seed(0)
-    model = MotionLM(case.size, VerletTokenizer()).to(case.device).eval()
+    model = named_model(case.model).to(case.device).eval()
     scenes = [crowded_scene(case.agents, SEGMENTS, seed=index) for index in range(case.scenes)]
     make = {"collector": _collected, "ranked": _collected, "trained": _trained}.get(case.how, _bare)
     episode = make(case, model, scenes)
@@ -179,13 +180,13 @@ def run(case: Case) -> dict[str, float]:
     return {"seconds": seconds, "agent_steps_per_second": case.agent_steps / seconds, "gib": gib}
 
 
-def _bare(case: Case, model: MotionLM, scenes: list[Scene]) -> Callable[[], object]:
+def _bare(case: Case, model: MotionModel, scenes: list[Scene]) -> Callable[[], object]:
     """Environment and policy called in turn, and nothing kept."""
     env = TrafficEnv(scenes, num_scenes=case.scenes, num_rollouts=case.rollouts, device=case.device)
     driven = TransformedEnv(env, TokenAction(model.tokenizer))
     kind = {"naive": NaiveActor, "uncached": UncachedActor}.get(case.how, MotionActor)
     options = {"num_rollouts": case.rollouts, "decoding": Decoding(), "compile": case.how == "compiled"}
-    actor = kind(model, Contexts(scenes), **options)
+    actor = kind(model, Contexts(scenes, model.featurize), **options)
 
     def episode() -> None:
         state = driven.reset()
@@ -195,7 +196,7 @@ def _bare(case: Case, model: MotionLM, scenes: list[Scene]) -> Callable[[], obje
     return torch.no_grad()(episode)
 
 
-def _collected(case: Case, model: MotionLM, scenes: list[Scene]) -> Callable[[], object]:
+def _collected(case: Case, model: MotionModel, scenes: list[Scene]) -> Callable[[], object]:
     """What recipes do: environment, policy and collector made anew for each task."""
     rank = partial(RankRollouts, num_rollouts=case.rollouts) if case.how == "ranked" else None
     worker = RolloutWorker(RolloutJob(scenes, model, case.rollouts, device=case.device, make_postproc=rank))
@@ -203,11 +204,13 @@ def _collected(case: Case, model: MotionLM, scenes: list[Scene]) -> Callable[[],
     return lambda: worker.run(task)
 
 
-def _trained(case: Case, model: MotionLM, scenes: list[Scene]) -> Callable[[], object]:
+def _trained(case: Case, model: MotionModel, scenes: list[Scene]) -> Callable[[], object]:
     """Loss and gradients of the logs of all scenes."""
     loss = NextTokenLoss(token_network(model.train()))
-    tokenizer = VerletTokenizer()
-    batch = collate_items([log_item(make_context(scene), tokenizer) for scene in scenes]).to(case.device)
+    tokenizer = model.tokenizer.on_cpu()
+    batch = collate_items([log_item(make_context(scene, model.featurize), tokenizer) for scene in scenes]).to(
+        case.device
+    )
     return lambda: sum(value for key, value in loss(batch).items() if key.startswith("loss_")).backward()
 
 
@@ -235,7 +238,7 @@ def _limit(case: Case, row: dict[str, Any]) -> dict[str, float]:
 
 def operations_per_agent_step(case: Case) -> float:
     """Floating-point operations of matrix products and attention in one incremental episode, over its agent-steps."""
-    model = MotionLM(case.size, VerletTokenizer()).eval()
+    model = named_model(case.model).eval()
     few = replace(case, how="incremental", rollouts=min(case.rollouts, 4), scenes=1, device="cpu")
     episode = _bare(few, model, [crowded_scene(case.agents, SEGMENTS)])
     with torch.nn.attention.sdpa_kernel(torch.nn.attention.SDPBackend.MATH), FlopCounterMode(display=False) as counter:

@@ -20,11 +20,11 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from dpa.policy import SIZES
-from dpa.policy.precision import PRECISIONS
+from dpa.models.precision import PRECISIONS
 from dpa.report.curves import read_curves
 from dpa.training.run import SECONDS
 from envs.progress import progress
+from recipes.common.models import named_models
 
 BATCH = 8
 HERE = Path(__file__).parents[2]
@@ -36,14 +36,14 @@ class Case:
 
     Attributes:
         checkout: folder of the code.
-        size: of the model.
+        model: name of its YAML.
         processes: that share a batch, started by torchrun.
         threads: of torch in each.
         precision: of linear layers; None leaves it to the checkout, which may not know the option.
     """
 
     checkout: Path
-    size: str
+    model: str
     processes: int
     threads: int
     precision: str | None
@@ -52,7 +52,7 @@ class Case:
 def add_options(part: argparse.ArgumentParser) -> None:
     """Options of ``python -m recipes.benchmark training``."""
     part.add_argument(
-        "--size", nargs="+", choices=sorted(SIZES), default=["nano", "paper"], help="of the model (default: both)"
+        "--model", nargs="+", choices=named_models(), default=["nano", "paper"], help="the policy (default: both)"
     )
     part.add_argument(
         "--precision", nargs="+", choices=PRECISIONS, help="of linear layers, here (default: that of the recipe)"
@@ -88,8 +88,8 @@ def measure(options: dict[str, Any]) -> list[dict[str, Any]]:
             raise ValueError(f"--against={checkout} holds no recipes/pretrain.py; name the folder of a checkout.")
     ways = {(1, options["cores"]), (options["cores"], 1)}
     cases = [
-        Case(checkout, size, *way, precision)
-        for size, way, (checkout, precision) in product(options["size"], sorted(ways), checkouts)
+        Case(checkout, model, *way, precision)
+        for model, way, (checkout, precision) in product(options["model"], sorted(ways), checkouts)
     ]
     with tempfile.TemporaryDirectory() as temporary:
         scenes = Path(options["folder"] or temporary, "scenes").absolute()
@@ -107,7 +107,7 @@ def run(case: Case, options: dict[str, Any], scenes: Path, output: Path) -> dict
     epoch = options["scenes"] // BATCH
     made = f"max_agents={options['agents']},windows=1,scenes_per_unit=1"
     arguments = [
-        f"model={case.size}",
+        f"model={case.model}",
         f"model.context.max_pieces={options['pieces']}",
         f"pretraining.max_agents={options['agents']}",
         f"pretraining.batch_size={BATCH}",
@@ -151,6 +151,6 @@ def _print(rows: list[dict[str, Any]]) -> None:
         speeds = row["scenes_per_second"]
         way, where = f"{row['processes']} x {row['threads']}", Path(row["checkout"]).name
         table.add_row(
-            row["size"], way, where, row["precision"] or "", f"{speeds['first']:.1f}", f"{speeds['later']:.1f}"
+            row["model"], way, where, row["precision"] or "", f"{speeds['first']:.1f}", f"{speeds['later']:.1f}"
         )
     Console(markup=False, width=110).print(table)

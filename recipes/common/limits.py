@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
-from dpa.policy.precision import PRECISIONS
+from dpa.models.precision import PRECISIONS
 from dpa.training.optim import OPTIMIZERS, SCHEDULES
 
 

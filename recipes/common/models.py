@@ -10,43 +10,71 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from dpa import zoo
-from dpa.policy import SIZES, ContextOptions, MotionLM, MotionLMConfig
+from dpa.models import MotionModel
+from dpa.models.registry import FAMILIES, build_model, size_of
 from dpa.tokens import MotionTokenizer, VerletTokenizer
 from dpa.training.checkpoint import CheckpointError, load_policy, load_weights, save_policy
-from recipes.common.cli import build, plain
+from envs.episode import EpisodeOptions
+from recipes.common.cli import CONFIG, build, plain
 
 TOKENIZERS = {"verlet": VerletTokenizer}
 """Tokenizers that a YAML can name; add a class of your own here (docs/how-to.md)."""
 
 
-def context_options(cfg: DictConfig) -> ContextOptions:
-    """How scenes are cut up, from ``cfg.model.context``."""
-    return build(ContextOptions, cfg.context, "model.context")
+def episode_options(cfg: DictConfig) -> EpisodeOptions:
+    """Who takes part, whom a policy moves and for how long, from ``cfg.model.episode``."""
+    return build(EpisodeOptions, cfg.episode, "model.episode")
 
 
 def policy_config(cfg: DictConfig) -> dict[str, Any]:
     """Everything that decides a policy's shape, from ``cfg.model``: what a checkpoint is compared with."""
-    if cfg.size not in SIZES:
-        raise ValueError(f"model.size must be one of {sorted(SIZES)}, got {cfg.size!r}.")
+    size, episode = size_of(cfg.family, cfg.size), episode_options(cfg)
     if cfg.tokenizer.name not in TOKENIZERS:
         raise ValueError(f"model.tokenizer.name must be one of {sorted(TOKENIZERS)}, got {cfg.tokenizer.name!r}.")
-    context = context_options(cfg)
     tokenizer = build_tokenizer(plain(cfg.tokenizer))
-    if tokenizer.steps != context.decision_steps:
+    if tokenizer.steps != episode.decision_steps:
         raise ValueError(
             f"a token of model.tokenizer.name={cfg.tokenizer.name} has {tokenizer.steps} poses and "
-            f"model.context.decision_steps={context.decision_steps}; they must be equal."
+            f"model.episode.decision_steps={episode.decision_steps}; they must be equal."
         )
-    size = SIZES[cfg.size].as_dict() | {"horizon": context.horizon, "dropout": cfg.dropout}
-    return {"model": size, "tokenizer": plain(cfg.tokenizer), "context": asdict(context)}
+    return {
+        "family": cfg.family,
+        "model": size | {"horizon": episode.horizon, "dropout": cfg.dropout},
+        "context": asdict(build(FAMILIES[cfg.family].context, cfg.context, "model.context")),
+        "tokenizer": plain(cfg.tokenizer),
+        "episode": asdict(episode),
+    }
 
 
-def build_policy(config: dict[str, Any]) -> MotionLM:
+def build_policy(config: dict[str, Any]) -> MotionModel:
     """A fresh policy from :func:`policy_config`."""
-    return MotionLM(MotionLMConfig(**config["model"]), build_tokenizer(config["tokenizer"]))
+    return build_model(config, build_tokenizer(config["tokenizer"]))
+
+
+def named_models() -> list[str]:
+    """Names of the models that have a YAML in ``recipes/config/model``.
+
+    Examples:
+        >>> {"nano", "small", "paper"} <= set(named_models())
+        True
+    """
+    found = Path(CONFIG["config_path"], "model").glob("*.yaml")
+    return sorted(path.stem for path in found if path.stem != "base")
+
+
+def named_model(name: str) -> MotionModel:
+    """A fresh policy by the name of its YAML.
+
+    Examples:
+        >>> named_model("nano").config.width
+        48
+    """
+    with initialize_config_dir(CONFIG["config_path"], version_base=CONFIG["version_base"]):
+        return build_policy(policy_config(compose("pretrain", [f"model={name}"]).model))
 
 
 def build_tokenizer(section: Mapping[str, Any]) -> MotionTokenizer:
@@ -55,7 +83,7 @@ def build_tokenizer(section: Mapping[str, Any]) -> MotionTokenizer:
     return build(TOKENIZERS[section["name"]], DictConfig(options), f"model.tokenizer ({section['name']})")
 
 
-def write_policy(path: Path, model: MotionLM, config: dict[str, Any], metadata: dict[str, Any]) -> None:
+def write_policy(path: Path, model: MotionModel, config: dict[str, Any], metadata: dict[str, Any]) -> None:
     """Save a policy with what it is and where it comes from."""
     save_policy(path, model.state_dict(), config, metadata)
 
@@ -86,8 +114,8 @@ def policy_file(name: str | Path) -> Path:
     return zoo.find(text.removeprefix(zoo.PREFIX)) if text.startswith(zoo.PREFIX) else Path(name)
 
 
-def open_policy(path: str | Path, device: str = "cpu") -> tuple[MotionLM, ContextOptions, dict[str, Any]]:
-    """A saved policy, its context options and its configuration.
+def open_policy(path: str | Path, device: str = "cpu") -> tuple[MotionModel, EpisodeOptions, dict[str, Any]]:
+    """A saved policy, the options of its episodes and its configuration.
 
     Args:
         path: file, or ``zoo:NAME``.
@@ -97,15 +125,14 @@ def open_policy(path: str | Path, device: str = "cpu") -> tuple[MotionLM, Contex
         FileNotFoundError: no such file.
         CheckpointError: the file is damaged or no policy.
         ValueError: the zoo has no such policy.
-        CheckpointError: the file is damaged or no policy.
     """
     weights, config, _ = load_policy(policy_file(path))
     try:
-        model, context = build_policy(config), ContextOptions(**config["context"])
+        model, episode = build_policy(config), EpisodeOptions(**config["episode"])
     except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise CheckpointError(f"{path} has a configuration that makes no policy ({error!r}).") from None
     load_weights(model, weights, config, config, where=str(path))
-    return model.to(device).eval(), context, config
+    return model.to(device).eval(), episode, config
 
 
 def policies_of(cfg: DictConfig) -> dict[str, Path]:

@@ -9,7 +9,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from dpa.policy import MotionLM
+from dpa.models import MotionModel
 from dpa.preferences import PreferenceStore
 from dpa.ranking import Distance, PreferenceDistance, Ranking
 from dpa.ranking.rival import DisplacementDistance
@@ -75,7 +75,7 @@ def open_ranked_scenes(folder: str | Path, scenes: SceneStore) -> PreferenceStor
     return store
 
 
-def open_preferences(folder: str | Path, scenes: SceneStore, model: MotionLM, policy: str | Path) -> PreferenceStore:
+def open_preferences(folder: str | Path, scenes: SceneStore, model: MotionModel, policy: str | Path) -> PreferenceStore:
     """A preference store, refused where its tokens would mean nothing here.
 
     Args:

@@ -10,10 +10,11 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from dpa.policy import ContextOptions, Decoding, MotionLM, make_context
+from dpa.models import Decoding, MotionModel
 from dpa.preferences import PreferenceStore
 from dpa.rollout import lifted, make_collector, simulated_poses
 from envs import keys
+from envs.episode import EpisodeOptions, make_episode
 from envs.scene import Scene, SceneSource
 from recipes.common.cli import build
 
@@ -57,7 +58,7 @@ def rolled(
 
 
 def driven(
-    scenes: SceneSource, model: MotionLM, options: ContextOptions, cfg: DictConfig
+    scenes: SceneSource, model: MotionModel, options: EpisodeOptions, cfg: DictConfig
 ) -> Iterator[tuple[int, Tensor]]:
     """Index and trajectories ``[K, A, 80, 4]`` of every scene, driven by a model.
 
@@ -81,7 +82,7 @@ def driven(
 
 
 def stored(
-    store: PreferenceStore, rows: Iterable[int], scenes: SceneSource, model: MotionLM, options: ContextOptions
+    store: PreferenceStore, rows: Iterable[int], scenes: SceneSource, model: MotionModel, options: EpisodeOptions
 ) -> Iterator[Rolled]:
     """Some scenes of a preference store, as they drove: poses follow from tokens, and the log replays the others.
 
@@ -95,10 +96,10 @@ def stored(
     for row in rows:
         index = int(store.scenes[row])
         scene = scenes[index]
-        context = make_context(scene, options)
-        group = store.read([row], num_agents=len(context.kind))[0]
+        episode = make_episode(scene, options)
+        group = store.read([row], num_agents=len(episode.kind))[0]
         tokens, controlled = group[keys.TOKENS], group[keys.TOKEN_VALID][:, 0]
-        recent, kind = (value.expand(len(tokens), *value.shape) for value in (context.recent, context.kind))
+        recent, kind = (value.expand(len(tokens), *value.shape) for value in (episode.recent, episode.kind))
         decoded = model.tokenizer.decode_tracks(tokens, recent, kind)
-        trajectories = lifted(scene, torch.where(controlled[:, None, None], decoded, context.logged))
+        trajectories = lifted(scene, torch.where(controlled[:, None, None], decoded, episode.logged))
         yield Rolled(index, scene, trajectories, controlled[: trajectories.shape[1]])

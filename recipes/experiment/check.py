@@ -9,20 +9,19 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from dpa.policy import Decoding, MotionLM
+from dpa.models import Decoding
 from dpa.ranking import PreferenceDistance
 from dpa.realism.config import RealismConfig
 from dpa.report.experiment import REPORTED, read_experiment
 from dpa.report.table import REFERENCE
 from dpa.rewards import check_horizon
-from dpa.tokens import VerletTokenizer
 from envs.options import differences
 from recipes.alignment.data import check_data, rewards_of
 from recipes.alignment.losses import check_fit, make_loss
 from recipes.collect import check_collection
 from recipes.common.cli import check_steps, plain, told_of
 from recipes.common.limits import GROUPS, check_limits, is_number
-from recipes.common.models import policy_config
+from recipes.common.models import build_policy, episode_options, policy_config
 from recipes.common.rankings import build_distance, ranking_options
 from recipes.experiment.jobs import reference_of, trained_in
 from recipes.experiment.methods import policies_of, read_setups
@@ -154,7 +153,7 @@ def _check_rankings(cfg: DictConfig) -> None:
 
 
 def _check_methods(cfg: DictConfig) -> None:
-    model = MotionLM("nano", VerletTokenizer())  # any will do: a loss is made to see its options refused
+    model = build_policy(policy_config(cfg.model))  # a loss is made to see its options refused
     for name, setup in read_setups(cfg).items():
         if unknown := sorted(set(cfg.methods[name]) - {"name", "data", "loss"}):
             raise ValueError(
@@ -173,7 +172,7 @@ def _check_methods(cfg: DictConfig) -> None:
         with told_of(f"methods.{name}"):
             check_fit(cfg.methods[name], alignment, cfg.collection.num_rollouts)
             data = check_data(cfg.methods[name].data, cfg.collection.num_rollouts)
-            check_horizon(rewards_of(data), cfg.model.context.decision_steps * cfg.model.context.horizon)
+            check_horizon(rewards_of(data), episode_options(cfg.model).steps)
             make_loss(cfg.methods[name].loss, model)
             check_steps(alignment, "alignment")
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from dpa.policy import Decoding
+from dpa.models import Contexts, Decoding
 from dpa.report.table import REFERENCE
 from dpa.training.run import seconds_trained
 from envs.files import write_bytes, write_json
@@ -155,7 +155,8 @@ def likelihood_job(cfg: DictConfig, seed: int, policy: str, split: str) -> None:
         raise ValueError(
             f"{store.folder} holds {len(store)} of {len(scenes)} scenes; run the same command again to fill it."
         )
-    probes = make_probes(store, scenes, options, model.tokenizer.on_cpu(), pairs)
+    contexts = Contexts(scenes, model.featurize, options, most=1)
+    probes = make_probes(store, contexts, model.tokenizer.on_cpu(), pairs)
     found = probe(model.to(cfg.device), reference.to(cfg.device), probes, cfg.device)
     drift = divergence(
         model,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from dpa.policy import Decoding
+from dpa.models import Decoding
 from dpa.report.table import REFERENCE
 
 SNAPSHOT = "@"

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from dpa.discriminator import ROAD, observed_motion, width_of
-from dpa.policy import ContextOptions, make_context
 from dpa.ranking.features import feature_names
 from dpa.rollout import lifted
 from dpa.tokens import MotionTokenizer
+from envs.episode import EpisodeOptions, make_episode
 from envs.files import PARTIAL_PREFIX, read_arrays, whole, write_json
 from envs.options import differences
 from envs.scene import CURRENT_STEP, Scene
@@ -79,13 +79,13 @@ class Sight:
         return Motions(values[:1], values[1:], valid)
 
 
-def driven_log(scene: Scene, tokenizer: MotionTokenizer, options: ContextOptions, *, tokenized: bool) -> Tensor:
+def driven_log(scene: Scene, tokenizer: MotionTokenizer, options: EpisodeOptions, *, tokenized: bool) -> Tensor:
     """The log as a policy would have driven it: by tokens, at the height of the road; others replay as in a rollout.
 
     Args:
         scene: uncollated.
         tokenizer: of the policy.
-        options: how the policy cuts scenes up; they say whom it moves.
+        options: of the episode; they say whom the policy moves.
         tokenized: otherwise controlled agents keep their logged poses.
 
     Returns:
@@ -95,15 +95,15 @@ def driven_log(scene: Scene, tokenizer: MotionTokenizer, options: ContextOptions
         >>> from dpa.tokens import VerletTokenizer
         >>> from envs.sources.synthetic import straight_road
         >>> scene, tokenizer = straight_road(2, seed=0), VerletTokenizer()
-        >>> sides = [driven_log(scene, tokenizer, ContextOptions(), tokenized=side) for side in (True, False)]
+        >>> sides = [driven_log(scene, tokenizer, EpisodeOptions(), tokenized=side) for side in (True, False)]
         >>> 0 < (sides[0] - sides[1]).abs().max() < 0.3
         tensor(True)
     """
-    context = make_context(scene, options)
-    poses = context.logged
+    episode = make_episode(scene, options)
+    poses = episode.logged
     if tokenized:
-        tracks = tokenizer.encode_tracks(poses, context.logged_valid, context.recent, context.kind)
-        poses = torch.where(context.controlled[:, None, None], tracks.poses, poses)
+        tracks = tokenizer.encode_tracks(poses, episode.logged_valid, episode.recent, episode.kind)
+        poses = torch.where(episode.controlled[:, None, None], tracks.poses, poses)
     return lifted(scene, poses[None])[0]
 
 

@@ -11,11 +11,12 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from dpa.policy import ContextOptions, Decoding, MotionLM
+from dpa.models import Decoding, MotionModel
 from dpa.ranking import Distance
 from dpa.report.statistics import Interval, summary
 from dpa.rollout import make_collector
 from dpa.training.checkpoint import load_policy
+from envs.episode import EpisodeOptions
 from envs.files import write_json
 from envs.progress import progress
 from envs.seeding import make_generator
@@ -68,7 +69,7 @@ def study_policy(
     cfg: DictConfig, scenes: SceneStore, policy: Path, measure: Measure, decided_by: dict[str, Any], name: str
 ) -> list[dict]:
     """What ``measure`` gives for each scene under one policy; arguments and files as in :func:`study`."""
-    model, context, _ = open_policy(policy, cfg.device)
+    model, episode, _ = open_policy(policy, cfg.device)
     options = decided_by | {
         "policy": weights_digest(model),
         "scenes": fingerprint(scenes),
@@ -82,7 +83,7 @@ def study_policy(
         return done["per_scene"]
     partial = PartialResult(path, options)
     found = partial.read()
-    for each in rolled_out(cfg, scenes, model, context, cfg.num_rollouts, frozenset(found), name):
+    for each in rolled_out(cfg, scenes, model, episode, cfg.num_rollouts, frozenset(found), name):
         numbers = measure(each)
         partial.add({each.index: numbers})
         found[each.index] = numbers
@@ -95,8 +96,8 @@ def study_policy(
 def rolled_out(
     cfg: DictConfig,
     scenes: SceneStore,
-    model: MotionLM,
-    options: ContextOptions,
+    model: MotionModel,
+    options: EpisodeOptions,
     num_rollouts: int,
     done: frozenset[int],
     name: str,

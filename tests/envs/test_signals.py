@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import pytest
 import torch
@@ -19,6 +19,7 @@ from dpa.realism import RealismConfig, compare, measure
 from dpa.rollout import lifted, simulated_poses
 from dpa.tokens import TokenAction, VerletTokenizer
 from envs import keys, signals
+from envs.episode import EpisodeOptions
 from envs.geometry.paths import distance_along
 from envs.scene import CURRENT_STEP, AgentKind, Lights, LightState, MapKind, Scene
 from envs.signals import SIGNALS, signal
@@ -76,8 +77,8 @@ class Gentle(TensorDictModuleBase):
 
 def roll(env: TrafficEnv, seed: int = 0) -> TensorDictBase:
     """An episode of random tokens ``[B, T]``."""
-    tokens = TokenAction(VerletTokenizer(steps=env.decision_steps))
-    return TransformedEnv(env, tokens).rollout(env.horizon, Gentle(seed))
+    tokens = TokenAction(VerletTokenizer(steps=env.episode.decision_steps))
+    return TransformedEnv(env, tokens).rollout(env.episode.horizon, Gentle(seed))
 
 
 # --- against the realism metric -------------------------------------------------------------------------------------
@@ -93,7 +94,11 @@ def test_events_are_those_of_the_realism_metric_on_the_same_trajectories(decisio
     scenes, rollouts = [crossing(5, seed=1), crossing(3, seed=2), straight_road(2)], 3
     horizon = 80 // decision_steps
     env = TrafficEnv(
-        scenes, num_scenes=3, num_rollouts=rollouts, signals=ALL, decision_steps=decision_steps, horizon=horizon
+        scenes,
+        EpisodeOptions(decision_steps=decision_steps, horizon=horizon),
+        num_scenes=3,
+        num_rollouts=rollouts,
+        signals=ALL,
     )
     rollout = roll(env)
     poses = simulated_poses(rollout, rollouts)
@@ -135,10 +140,11 @@ def test_rows_at_different_decisions_see_their_own_lights() -> None:
 
 
 # --- by hand --------------------------------------------------------------------------------------------------------
-def replay(scene: Scene, **options: object) -> TensorDictBase:
+def replay(scene: Scene, signals: Sequence[str], **episode: int) -> TensorDictBase:
     """An episode ``[T]`` in which everybody follows the log."""
-    env = TrafficEnv([scene], control=lambda s: torch.zeros_like(s.agents.sdc), **options)
-    return env.rollout(env.horizon)[0]["next"]
+    options = EpisodeOptions(control=lambda s: torch.zeros_like(s.agents.sdc), **episode)
+    env = TrafficEnv([scene], options, signals=signals)
+    return env.rollout(env.episode.horizon)[0]["next"]
 
 
 def test_two_cars_collide_while_they_overlap_and_not_before_or_after() -> None:
@@ -212,7 +218,7 @@ def test_heights_tell_a_bridge_from_the_road_below() -> None:
     for height, expected in ((8.75, [False, True]), (0.75, [False, False])):
         scene.agents.position[1, :, 2] = height
         for control in ("all", lambda s: torch.zeros_like(s.agents.sdc)):
-            env = TrafficEnv([scene], signals=("offroad",), control=control)
+            env = TrafficEnv([scene], EpisodeOptions(control=control), signals=("offroad",))
             action = torch.zeros(1, 2, 5, 3)
             action[..., 0] = torch.arange(1, 6) * 0.5
             after = env.step(env.reset().set(keys.ACTION, action))["next"]
@@ -222,7 +228,7 @@ def test_heights_tell_a_bridge_from_the_road_below() -> None:
 def test_agents_that_are_not_there_signal_nothing() -> None:
     scene = crossing(4)
     scene.agents.valid[3, 30:] = False
-    rollout = roll(TrafficEnv([scene], signals=ALL, num_agents=6, control="sdc"))["next"]
+    rollout = roll(TrafficEnv([scene], EpisodeOptions(control="sdc"), signals=ALL, num_agents=6))["next"]
     for name in ALL:
         assert not rollout[keys.AGENTS, name][:, 4:, 3:].any()
 
@@ -264,7 +270,7 @@ def test_what_is_not_asked_for_costs_nothing(monkeypatch: pytest.MonkeyPatch, as
     needed = set().union(*(NEEDS[name] for name in asked))
     for name in set(GEOMETRY) - needed:
         monkeypatch.setattr(signals, name, refuse)
-    env = TrafficEnv([crossing(3)], signals=asked, horizon=2)
+    env = TrafficEnv([crossing(3)], EpisodeOptions(horizon=2), signals=asked)
     rollout = env.rollout(2)
     for name in ALL:
         assert ((keys.AGENTS, name) in rollout["next"].keys(True)) == (name in asked)
@@ -282,7 +288,7 @@ def test_each_needs_what_it_is_said_to_need(monkeypatch: pytest.MonkeyPatch) -> 
             return _inner(*arguments)
 
         monkeypatch.setattr(signals, name, spy)
-    TrafficEnv([crossing(3)], signals=ALL, horizon=1).rollout(1)
+    TrafficEnv([crossing(3)], EpisodeOptions(horizon=1), signals=ALL).rollout(1)
     assert called == {"nearest_box_distance", "climb", "crosses_red", "distance_along"}
 
 
@@ -291,8 +297,8 @@ def test_each_needs_what_it_is_said_to_need(monkeypatch: pytest.MonkeyPatch) -> 
 def test_any_length_of_a_decision_keeps_the_specs(steps: int, horizon: int, asked: set[str], arrivals: bool) -> None:
     scene = crossing(4, seed=3)
     scene.agents.valid[1, :14] = False
-    options = {"decision_steps": steps, "horizon": horizon, "signals": sorted(asked), "arrivals": arrivals}
-    check_env_specs(TrafficEnv([scene, crossing(2)], num_scenes=2, **options))
+    episode = EpisodeOptions(decision_steps=steps, horizon=horizon, arrivals=arrivals)
+    check_env_specs(TrafficEnv([scene, crossing(2)], episode, num_scenes=2, signals=sorted(asked)))
 
 
 def test_a_step_is_a_decision_whatever_its_length() -> None:

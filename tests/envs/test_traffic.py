@@ -14,6 +14,7 @@ from torchrl.envs.utils import check_env_specs
 
 from dpa.tokens import TokenAction, VerletTokenizer
 from envs import keys
+from envs.episode import EpisodeOptions
 from envs.geometry.frames import to_local
 from envs.participants import choose_controlled, largest_scene
 from envs.scene import CURRENT_STEP, AgentKind, MapKind, Scene
@@ -23,13 +24,16 @@ from envs.traffic import TrafficEnv
 EDGE = [(MapKind.EDGE_BOUNDARY, torch.tensor([[50.0, 5.0], [-50.0, 5.0]]))]
 
 
-def with_tokens(**options: int) -> TransformedEnv:
+def with_tokens(horizon: int) -> TransformedEnv:
     scenes = [straight_road(2), straight_road(3)]
-    return TransformedEnv(TrafficEnv(scenes, num_scenes=2, num_rollouts=2, **options), TokenAction(VerletTokenizer()))
+    env = TrafficEnv(scenes, EpisodeOptions(horizon=horizon), num_scenes=2, num_rollouts=2)
+    return TransformedEnv(env, TokenAction(VerletTokenizer()))
 
 
 ENVIRONMENTS: dict[str, Callable[[], TrafficEnv]] = {
-    "alone": lambda: TrafficEnv([straight_road(2), straight_road(3)], num_scenes=2, num_rollouts=3, horizon=4),
+    "alone": lambda: TrafficEnv(
+        [straight_road(2), straight_road(3)], EpisodeOptions(horizon=4), num_scenes=2, num_rollouts=3
+    ),
     "with tokens": lambda: with_tokens(horizon=4),
     "in a serial environment": lambda: SerialEnv(2, lambda: with_tokens(horizon=4)),
 }
@@ -63,8 +67,8 @@ class Stand(TensorDictModuleBase):
 def follow_log(env: TrafficEnv, state: TensorDictBase) -> TensorDictBase:
     scenes = [env._padded(index) for index in state[keys.SCENE].tolist()]
     poses = torch.stack([scene.agents.poses for scene in scenes])
-    first = CURRENT_STEP + 1 + state[keys.STEP] * env.decision_steps
-    index = first + torch.arange(env.decision_steps)  # [B, F]
+    first = CURRENT_STEP + 1 + state[keys.STEP] * env.episode.decision_steps
+    index = first + torch.arange(env.episode.decision_steps)  # [B, F]
     target = poses[torch.arange(len(poses))[:, None], :, index].transpose(1, 2)
     return state.set(keys.ACTION, to_local(target, state[keys.RECENT][..., -1:, :]))
 
@@ -116,7 +120,7 @@ def test_an_episode_starts_with_the_last_half_second_of_the_log() -> None:
 @pytest.mark.parametrize("decision_steps", [1, 5, 10])
 def test_an_action_that_reproduces_the_log_costs_nothing(decision_steps: int) -> None:
     scenes = [wavy(3), wavy(2, seed=1)]
-    env = TrafficEnv(scenes, num_scenes=2, decision_steps=decision_steps, horizon=80 // decision_steps)
+    env = TrafficEnv(scenes, EpisodeOptions(decision_steps=decision_steps, horizon=80 // decision_steps), num_scenes=2)
     rollout = env.rollout(80, FollowLog(env))
     poses = rollout["next", *keys.RECENT][..., 1:, :].movedim(1, 2).flatten(2, 3)
     for row, scene in enumerate(scenes):
@@ -182,7 +186,10 @@ def crowd() -> Scene:
 def test_evaluated_agents_are_controlled_first_and_then_the_nearest_to_the_sdc(limit: int, expected: list[int]) -> None:
     chosen = choose_controlled(crowd(), limit)
     assert chosen.nonzero()[:, 0].tolist() == expected
-    assert TrafficEnv([crowd()], max_controlled=limit).reset()[keys.CONTROLLED][0].tolist() == chosen.tolist()
+    assert (
+        TrafficEnv([crowd()], EpisodeOptions(max_controlled=limit)).reset()[keys.CONTROLLED][0].tolist()
+        == chosen.tolist()
+    )
 
 
 def test_agents_that_are_not_there_are_never_controlled() -> None:
@@ -194,7 +201,7 @@ def test_agents_that_are_not_there_are_never_controlled() -> None:
 
 def test_the_rest_follow_the_log_and_leave_with_it() -> None:
     scene = crowd()
-    env = TrafficEnv([scene], max_controlled=2)
+    env = TrafficEnv([scene], EpisodeOptions(max_controlled=2))
     rollout = env.rollout(16, Stand())
     replayed = [0, 2, 3, 4]
     poses = rollout["next", *keys.RECENT][0, :, :, 1:].movedim(0, 1).flatten(1, 2)
@@ -215,7 +222,7 @@ def test_an_agent_in_a_hole_of_its_log_moves_on_and_is_not_there() -> None:
     scene.agents.valid[3] = True
     scene.agents.position[3, hole], scene.agents.valid[3, hole] = 0.0, False
     scene.agents.velocity[3] = torch.tensor([1.0, 0.0])
-    rollout = TrafficEnv([scene], max_controlled=2).rollout(16, Stand())
+    rollout = TrafficEnv([scene], EpisodeOptions(max_controlled=2)).rollout(16, Stand())
     x = rollout["next", *keys.RECENT][0, :, 3, 1:, 0].flatten()
     torch.testing.assert_close(x, 30.0 + 0.1 * torch.arange(CURRENT_STEP + 1, 91), atol=1e-4, rtol=0)
     assert rollout["next", *keys.VALID][0, :, 3].tolist() == [True, False, False, False, *[True] * 12]
@@ -225,7 +232,8 @@ def test_what_lies_where_the_log_has_nothing_does_not_move_anybody() -> None:
     scene, other = crowd(), crowd()
     other.agents.position[3, 30:] = torch.tensor([-500.0, 0.0, 0.0])
     poses, moved = (
-        TrafficEnv([each], max_controlled=2).rollout(16, Stand())["next", *keys.RECENT] for each in (scene, other)
+        TrafficEnv([each], EpisodeOptions(max_controlled=2)).rollout(16, Stand())["next", *keys.RECENT]
+        for each in (scene, other)
     )
     assert torch.equal(poses, moved)
 
@@ -244,7 +252,7 @@ def test_equal_seeds_give_equal_rollouts() -> None:
     scenes = [straight_road(2, seed=seed) for seed in range(5)]
 
     def rollout(seed: int) -> TensorDict:
-        env = TrafficEnv(scenes, num_scenes=3, order="random", horizon=2)
+        env = TrafficEnv(scenes, EpisodeOptions(horizon=2), num_scenes=3, order="random")
         env.set_seed(seed)
         torch.manual_seed(0)
         return env.rollout(6, break_when_any_done=False)
@@ -293,7 +301,7 @@ def test_a_group_that_is_reset_as_a_whole_moves_on_and_leaves_the_others_alone()
 
 
 def test_rows_end_when_their_own_horizon_is_reached() -> None:
-    env = TrafficEnv([wavy(2)], num_rollouts=2, horizon=4)
+    env = TrafficEnv([wavy(2)], EpisodeOptions(horizon=4), num_rollouts=2)
     state = reset_rows(env, steps(env, env.reset(), 2), [False, True])
     step = env.step(stand(state.exclude("_reset")))
     assert step["next", "done"][:, 0].tolist() == [False, False]
@@ -302,7 +310,7 @@ def test_rows_end_when_their_own_horizon_is_reached() -> None:
 
 
 def test_an_endless_rollout_goes_through_all_scenes() -> None:
-    env = TrafficEnv([straight_road(n) for n in (1, 2, 3)], num_rollouts=2, horizon=2)
+    env = TrafficEnv([straight_road(n) for n in (1, 2, 3)], EpisodeOptions(horizon=2), num_rollouts=2)
     seen = env.rollout(6, break_when_any_done=False)[keys.SCENE]
     assert seen.tolist() == [[0, 0, 1, 1, 2, 2]] * 2
 
@@ -330,7 +338,7 @@ def test_what_cannot_work_is_refused() -> None:
     with pytest.raises(ValueError, match="at least one scene"):
         TrafficEnv([])
     with pytest.raises(ValueError, match=r"at most 80 steps of 0.1 s, got 17 \* 5"):
-        TrafficEnv([straight_road()], horizon=17)
+        TrafficEnv([straight_road()], EpisodeOptions(horizon=17))
     with pytest.raises(ValueError, match=r"straight_road_3_None has 3 agents .* holds 2; raise num_agents"):
         TrafficEnv([straight_road(3)], num_agents=2).reset()
 

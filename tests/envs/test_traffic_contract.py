@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from functools import partial
 from typing import Any
 
@@ -22,6 +23,7 @@ from torchrl.envs.utils import check_env_specs
 
 from dpa.tokens import TokenAction, VerletTokenizer
 from envs import keys
+from envs.episode import EpisodeOptions
 from envs.rewards import SignalReward
 from envs.scene import Scene
 from envs.sources.synthetic import red_light, straight_road, two_cars_head_on
@@ -58,7 +60,15 @@ def scenes() -> list[Scene]:
 
 
 def make(horizon: int = 4, num_rollouts: int = 2, **options: Any) -> TrafficEnv:
-    return TrafficEnv(scenes(), num_scenes=2, num_rollouts=num_rollouts, horizon=horizon, **options)
+    episode, rest = told_apart({"horizon": horizon, **options})
+    return TrafficEnv(scenes(), EpisodeOptions(**episode), num_scenes=2, num_rollouts=num_rollouts, **rest)
+
+
+def told_apart(options: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Options of the episode, and the others."""
+    names = {field.name for field in fields(EpisodeOptions)}
+    episode = {name: value for name, value in options.items() if name in names}
+    return episode, {name: value for name, value in options.items() if name not in names}
 
 
 def gentle(env: EnvBase, state: TensorDictBase, seed: int) -> TensorDictBase:
@@ -241,8 +251,9 @@ def test_transforms_of_torchrl_can_be_appended(options: dict[str, Any]) -> None:
     ids=str,
 )
 def test_options_that_make_no_sense_are_refused(wrong: dict[str, Any], message: str) -> None:
+    episode, rest = told_apart(wrong)
     with pytest.raises(ValueError, match=message):
-        TrafficEnv(scenes(), **wrong)
+        TrafficEnv(scenes(), EpisodeOptions(**episode), **rest)
 
 
 @pytest.mark.parametrize(("mask", "got"), [(torch.ones(2, dtype=torch.bool), r"\(2,\) torch.bool"), ([True], "True")])
@@ -250,7 +261,7 @@ def test_a_control_that_gives_no_mask_of_the_agents_is_refused(mask: object, got
     with pytest.raises(
         ValueError, match=f"straight_road_3_None: control must give a bool mask of its 3 present .*{got}"
     ):
-        TrafficEnv([straight_road(3)], control=lambda scene: mask).reset()
+        TrafficEnv([straight_road(3)], EpisodeOptions(control=lambda scene: mask)).reset()
 
 
 # --- rewards --------------------------------------------------------------------------------------------------------
@@ -294,7 +305,7 @@ def test_arrivals_follow_the_present_agents_and_are_there_while_they_are_logged(
     valid = torch.zeros(4, 91, dtype=torch.bool)
     valid[0], valid[1, 23:61], valid[2, :31], valid[3, :5] = True, True, True, True
     scene.agents.valid = valid
-    env = TrafficEnv([scene], arrivals=True)
+    env = TrafficEnv([scene], EpisodeOptions(arrivals=True))
     rollout = env.rollout(16)
     assert env.num_agents == 3, "agent 3 is gone before the episode begins"
     state = torch.cat((rollout[keys.VALID][0, :1], rollout["next", keys.VALID][0]))  # at the steps 10, 15, 20, ...
@@ -310,11 +321,11 @@ def test_arrivals_follow_the_present_agents_and_are_there_while_they_are_logged(
 def test_agents_that_arrive_after_the_horizon_take_no_part() -> None:
     scene = straight_road(3)
     scene.agents.valid[1, :31], scene.agents.valid[2, :30] = False, False
-    assert TrafficEnv([scene], arrivals=True, horizon=4).num_agents == 2
-    assert TrafficEnv([scene], arrivals=True, horizon=16).num_agents == 3
-    assert TrafficEnv([scene], horizon=16).num_agents == 1
+    assert TrafficEnv([scene], EpisodeOptions(arrivals=True, horizon=4)).num_agents == 2
+    assert TrafficEnv([scene], EpisodeOptions(arrivals=True, horizon=16)).num_agents == 3
+    assert TrafficEnv([scene], EpisodeOptions(horizon=16)).num_agents == 1
     with pytest.raises(ValueError, match="has 3 agents in the episode and the environment holds 2; raise num_agents"):
-        TrafficEnv([scene], arrivals=True, num_agents=2).reset()
+        TrafficEnv([scene], EpisodeOptions(arrivals=True), num_agents=2).reset()
 
 
 def test_a_mask_is_of_the_present_agents_whatever_is_appended() -> None:
@@ -326,14 +337,14 @@ def test_a_mask_is_of_the_present_agents_whatever_is_appended() -> None:
         return torch.tensor([False, True, True])
 
     for arrivals in (False, True):
-        state = TrafficEnv([scene], control=last_two, arrivals=arrivals, num_agents=6).reset()
+        state = TrafficEnv([scene], EpisodeOptions(control=last_two, arrivals=arrivals), num_agents=6).reset()
         assert state[keys.CONTROLLED][0].tolist() == [False, True, True, False, False, False]
 
 
 def test_a_simulation_leaves_its_scene_alone() -> None:
     scene = scenes()[0]
     before = scene.clone()
-    TrafficEnv([scene], arrivals=True, signals=SIGNALS).rollout(16)
+    TrafficEnv([scene], EpisodeOptions(arrivals=True), signals=SIGNALS).rollout(16)
     assert (scene == before).all()
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from dpa import zoo
-from dpa.policy import MotionLM, MotionLMConfig
+from dpa.models.motionlm import MotionLM, MotionLMConfig
 from dpa.tokens import VerletTokenizer
 from dpa.training.checkpoint import FORMAT, CheckpointError, load_policy, save_policy
 from recipes.common.models import open_policy
@@ -26,9 +26,11 @@ from tests.fuzz.trees import edit_json
 
 TINY = {"width": 12, "heads": 3, "feed": 8, "encoder_layers": 1, "decoder_layers": 1, "horizon": 16, "dropout": 0.0}
 CONFIG = {
+    "family": "motionlm",
     "model": TINY,
+    "context": {"max_pieces": 16},
     "tokenizer": {"name": "verlet"},
-    "context": {"max_pieces": 16, "horizon": 16, "decision_steps": 5},
+    "episode": {"horizon": 16, "decision_steps": 5},
 }
 
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 from torchrl.envs import TransformedEnv
 
-from dpa.policy import MotionActor, MotionLM
-from dpa.policy.actor import Contexts
+from dpa.models import Contexts, MotionActor
+from dpa.models.motionlm import MotionLM, featurize
 from dpa.ranking import transport_cost
 from dpa.tokens import TokenAction, VerletTokenizer
 from envs import keys
@@ -65,7 +65,7 @@ def test_scenes_are_measured_raw_and_stored(make_scenario, tmp_path: Path, capsy
 @pytest.mark.slow
 def test_rollouts_are_measured_and_planned_with(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, plan = tmp_path / "rollout.json", tmp_path / "plan.json"
-    small = ["--size", "nano", "--agents", "2", "--rollouts", "2", "--threads", "1", "--repeats", "1"]
+    small = ["--model", "nano", "--agents", "2", "--rollouts", "2", "--threads", "1", "--repeats", "1"]
     assert main(["rollout", *small, "--json", str(out)]) == 0
     assert "incremental over naive" in capsys.readouterr().out
     *rows, limit = json.loads(out.read_text())["rows"]
@@ -83,7 +83,7 @@ def test_rollouts_are_measured_and_planned_with(tmp_path: Path, capsys: pytest.C
 @pytest.mark.slow
 def test_training_is_measured_beside_another_checkout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "training.json"
-    small = ["--size", "nano", "--agents", "6", "--pieces", "16", "--scenes", "12", "--epochs", "2", "--repeats", "1"]
+    small = ["--model", "nano", "--agents", "6", "--pieces", "16", "--scenes", "12", "--epochs", "2", "--repeats", "1"]
     here = ["--against", str(Path(__file__).parents[2]), "--folder", str(tmp_path), "--json", str(out)]
     assert main(["training", *small, *here]) == 0
     rows = json.loads(out.read_text())["rows"]
@@ -135,7 +135,7 @@ def test_the_naive_decoder_decodes_the_same(kind: type[MotionActor]) -> None:
     found = []
     for each in (MotionActor, kind):
         env = TransformedEnv(TrafficEnv(scenes, num_scenes=2, num_rollouts=2), TokenAction(model.tokenizer))
-        found.append(env.rollout(16, each(model, Contexts(scenes), num_rollouts=2)))
+        found.append(env.rollout(16, each(model, Contexts(scenes, featurize), num_rollouts=2)))
     controlled = found[0][keys.CONTROLLED]
     assert torch.equal(*(rollout[keys.TOKEN][controlled] for rollout in found))
     log_probs = (rollout[keys.LOG_PROB][controlled] for rollout in found)

@@ -15,13 +15,13 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from dpa.discriminator import Discriminator, mean_squared_jerk
-from dpa.policy import ContextOptions
 from dpa.ranking import PreferenceDistance, log_trajectory
 from dpa.ranking.agreement import rank_correlation
 from dpa.realism import RealismConfig
 from dpa.tokens import VerletTokenizer
 from dpa.training.checkpoint import load_policy
 from dpa.training.loggers import read_curve
+from envs.episode import EpisodeOptions
 from envs.scene import Scene
 from envs.sources.synthetic import straight_road
 from recipes import discriminator
@@ -163,12 +163,12 @@ def test_a_shelf_of_other_options_is_told_and_kept(tmp_path: Path) -> None:
 def test_the_log_goes_through_the_tokens_of_the_policy_and_what_is_not_controlled_replays() -> None:
     scene, tokenizer = straight_road(3, seed=5), VerletTokenizer()
     log = log_trajectory(scene, 80)
-    driven = driven_log(scene, tokenizer, ContextOptions(max_controlled=1), tokenized=True)
+    driven = driven_log(scene, tokenizer, EpisodeOptions(max_controlled=1), tokenized=True)
     moved = (driven - log)[..., :2].abs().amax((1, 2))
     assert moved[0] > 1e-3 and torch.equal(moved[1:], torch.zeros(2))
     bins = driven[0, 4::5, 0].diff(n=2) / tokenizer.bins[1, 0]
     assert torch.allclose(bins, bins.round(), atol=1e-3), "its displacements change by whole bins"
-    raw = driven_log(scene, tokenizer, ContextOptions(), tokenized=False)
+    raw = driven_log(scene, tokenizer, EpisodeOptions(), tokenized=False)
     assert torch.equal(raw[..., :2], log[..., :2])
 
 
@@ -293,7 +293,7 @@ def test_what_lies_behind_a_hole_of_the_log_has_no_jerk() -> None:
         each = Rolled(0, scene, poses, torch.ones(3, dtype=torch.bool))
         metric, distance = RealismConfig.load("2024"), PreferenceDistance()
         found.append(
-            discriminator.measure_scene(each, net, sight, VerletTokenizer(), ContextOptions(), distance, metric, 0)
+            discriminator.measure_scene(each, net, sight, VerletTokenizer(), EpisodeOptions(), distance, metric, 0)
         )
     for jerk in ("jerk", "jerk_2hz"):
         assert (

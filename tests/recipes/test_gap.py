@@ -13,9 +13,11 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from dpa.policy import ContextOptions, Decoding, MotionLM
+from dpa.models import Decoding
+from dpa.models.motionlm import MotionLM
 from dpa.realism import RealismConfig
 from dpa.tokens import VerletTokenizer
+from envs.episode import EpisodeOptions
 from envs.scene import CURRENT_STEP, MapKind, Scene
 from envs.sources.synthetic import build_scene, straight_road
 from recipes.common.cli import CONFIG
@@ -93,7 +95,7 @@ def test_a_scene_without_a_self_driving_car_is_refused() -> None:
 
 def rows(scene: Scene, model: type[MotionLM]) -> tuple[Tensor, Tensor, Tensor]:
     """``[A, 80, 4]`` of the log, of the log through tokens, and of single decisions."""
-    tokenizer, cut = VerletTokenizer(), ContextOptions()
+    tokenizer, cut = VerletTokenizer(), EpisodeOptions()
     options = OmegaConf.create({"num_rollouts": 1, "seed": 0, "device": "cpu"})
     decided = single_decisions([scene], model("nano", tokenizer), cut, Decoding(), options)
     return tuple(next(rolls)[1][0] for rolls in (logs([scene], cut, None), logs([scene], cut, tokenizer), decided))

@@ -9,8 +9,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from dpa.policy import ContextOptions, MotionLM, SceneContext, make_context
+from dpa.models import make_context
+from dpa.models.motionlm import MotionLM, SceneContext, featurize
 from dpa.tokens import VerletTokenizer
+from envs.episode import EpisodeOptions
 from envs.sources.synthetic import straight_road
 from recipes.alignment.likelihoods import SIDED, Probe, divergence, probe, probe_sides
 
@@ -32,7 +34,7 @@ def test_a_policy_is_asked_for_the_likelihood_of_logs_and_of_both_sides() -> Non
     probabilities = [0.5, 0.25, 0.125, 0.125]
     valid = torch.tensor([[True, True, True], [True, False, False]])
     asked = Probe(
-        context=make_context(straight_road(2)),
+        context=make_context(straight_road(2), featurize),
         demonstration=torch.tensor([[0, 1, 2], [3, 3, 3]]),
         demonstration_valid=torch.tensor([[True, True, True], [False, False, False]]),
         preferred=torch.tensor([[[0, 0, 0], [0, 3, 3]], [[2, 2, 2], [2, 0, 0]]]),
@@ -56,14 +58,14 @@ def test_sides_alone_are_what_the_whole_probe_says_of_them(model: MotionLM) -> N
     near, far = (torch.randint(60, 110, (3, 2, 16), generator=draw) for _ in range(2))
     valid = torch.ones(2, 16, dtype=torch.bool)
     valid[1, 9:] = False
-    asked = Probe(make_context(straight_road(2)), near[0], valid, near, far, valid)
+    asked = Probe(make_context(straight_road(2), featurize), near[0], valid, near, far, valid)
     (whole,), (sides,) = probe(model, model, [asked]), probe_sides(model, [asked])
     assert sides == {name: whole[name] for name in SIDED}
 
 
 def test_a_log_without_tokens_has_no_likelihood() -> None:
     tokens, nothing = torch.zeros(1, 1, 2, dtype=torch.int64), torch.zeros(1, 2, dtype=torch.bool)
-    asked = Probe(make_context(straight_road(1)), tokens[0], nothing, tokens, tokens + 1, ~nothing)
+    asked = Probe(make_context(straight_road(1), featurize), tokens[0], nothing, tokens, tokens + 1, ~nothing)
     policy = Steady([0.4, 0.3, 0.2, 0.1])
     found = probe(policy, policy, [asked])[0]
     assert math.isnan(found["nll_demonstration"]) and found["pair_accuracy"] == 1
@@ -72,7 +74,7 @@ def test_a_log_without_tokens_has_no_likelihood() -> None:
 
 def test_a_scene_without_tokens_ranks_nothing() -> None:
     tokens, nothing = torch.zeros(1, 1, 2, dtype=torch.int64), torch.zeros(1, 2, dtype=torch.bool)
-    asked = Probe(make_context(straight_road(1)), tokens[0], ~nothing, tokens, tokens + 1, nothing)
+    asked = Probe(make_context(straight_road(1), featurize), tokens[0], ~nothing, tokens, tokens + 1, nothing)
     found = probe(Steady([0.4, 0.3, 0.2, 0.1]), Steady([0.4, 0.3, 0.2, 0.1]), [asked])[0]
     unknown = {name for name, value in found.items() if math.isnan(value)}
     assert unknown == {*SIDED, "reward_accuracy", "entropy", "kl"}
@@ -86,7 +88,7 @@ def model() -> MotionLM:
 
 def test_a_policy_does_not_diverge_from_itself(model: MotionLM) -> None:
     scenes = [straight_road(1), straight_road(3)]
-    options = ContextOptions()
+    options = EpisodeOptions()
     same = divergence(model, model, scenes, options, num_rollouts=2, seed=0)
     assert same == pytest.approx([0, 0], abs=1e-6)
 
@@ -104,7 +106,7 @@ def test_divergence_is_that_of_the_distributions_along_the_models_own_rollouts(m
         biases.append(head.bias.detach().double())
     p, q = (bias.log_softmax(-1) for bias in biases)
     expected = (p.exp() * (p - q)).sum().item()
-    found = divergence(*steady, [straight_road(2)], ContextOptions(), num_rollouts=2, seed=0)
+    found = divergence(*steady, [straight_road(2)], EpisodeOptions(), num_rollouts=2, seed=0)
     assert found == pytest.approx([expected], abs=1e-5)
 
 

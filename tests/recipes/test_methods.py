@@ -12,7 +12,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from dpa.policy import Decoding
+from dpa.models import Decoding
 from envs.files import write_json
 from recipes.common.cli import CONFIG
 from recipes.compare import choose

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from dpa.policy import Decoding, collate_contexts, make_context
+from dpa.models import Decoding, collate_contexts, make_context
+from dpa.models.motionlm import featurize
 from dpa.ranking import PreferenceDistance, rank_of
 from dpa.ranking.rival import DisplacementDistance
 from dpa.report.player import PlayerScene, pack_players
@@ -44,11 +45,11 @@ def players(policy: Path, scenes: SceneStore) -> list[PlayerScene]:
 
 def sampled(policy: Path, scenes: SceneStore, index: int) -> tuple:
     """All rollouts of a scene, once more: of the collector, and scene by scene."""
-    model, context, _ = open_policy(policy)
+    model, episode, _ = open_policy(policy)
     (batch,) = make_collector(
-        scenes, model, num_rollouts=K, indices=[index], decoding=Decoding(top_p=1.0), options=context, seed=3
+        scenes, model, num_rollouts=K, indices=[index], decoding=Decoding(top_p=1.0), options=episode, seed=3
     )
-    return model, context, batch, next(rolled([batch], scenes, K))
+    return model, episode, batch, next(rolled([batch], scenes, K))
 
 
 def test_the_likelihood_of_a_rollout_is_that_of_its_tokens_teacher_forced(policy: Path, scenes: SceneStore) -> None:
@@ -56,7 +57,7 @@ def test_the_likelihood_of_a_rollout_is_that_of_its_tokens_teacher_forced(policy
     tokens = batch[keys.TOKEN].movedim(1, 2)[None]
     valid = each.controlled[None, None, :, None].expand(1, K, -1, tokens.shape[-1])
     with torch.no_grad():
-        context = collate_contexts([make_context(scenes[2], options)])
+        context = collate_contexts([make_context(scenes[2], featurize, options)])
         logits = model(context, tokens, valid[:, :1])
     nats = logits.log_softmax(-1).gather(-1, tokens[..., None])[..., 0]
     torch.testing.assert_close(log_likelihood(batch, K), (nats * valid).sum((2, 3)) / valid.sum((2, 3)))

@@ -21,7 +21,8 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 
 from dpa.losses import ContrastivePreferenceLoss, token_network
-from dpa.policy import MotionLM, make_context
+from dpa.models import Contexts, make_context
+from dpa.models.motionlm import MotionLM, featurize
 from dpa.preferences import PreferenceStore, PreferenceWriter, nearest_farthest
 from dpa.realism.config import FOLDER
 from dpa.realism.score import score
@@ -77,8 +78,8 @@ def weights(path: Path) -> torch.Tensor:
 
 # --- pretrain -------------------------------------------------------------------------------------------------------
 def test_pretraining_writes_a_policy_and_its_curves(runs: Path) -> None:
-    model, context, config = open_policy(runs / "reference/policy.pt")
-    assert model.config.width == 48 and context.horizon == 16
+    model, episode, config = open_policy(runs / "reference/policy.pt")
+    assert model.config.width == 48 and episode.horizon == 16
     assert config["tokenizer"]["name"] == "verlet"
     losses = read_curve(runs / "reference", "train/loss_next_token")
     assert [step for step, _ in losses] == [1, 2, 3, 4, 5, 6]
@@ -90,7 +91,7 @@ def test_tuning_scenes_without_a_token_to_predict_are_refused() -> None:
     scene = straight_road(2)
     scene.agents.predict[:] = False
     with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):
-        cfg = compose("pretrain", ["model=nano", "model.context.control=predict"])
+        cfg = compose("pretrain", ["model=nano", "model.episode.control=predict"])
     with pytest.raises(ValueError, match="none of the 1 tuning scenes has a token to predict: .*control=predict"):
         tuning_items(cfg, [scene], MotionLM("nano", VerletTokenizer()))
 
@@ -247,10 +248,12 @@ def pairs_of(runs: Path, options: Callable, expert: PreferenceStore | None = Non
     cfg = compose_recipe("align", options, runs)
     scenes = open_splits(cfg.scenes).train
     store = PreferenceStore(runs / "preferences")
-    model, context, _ = open_policy(runs / "reference/policy.pt")
+    model, episode, _ = open_policy(runs / "reference/policy.pt")
     section = OmegaConf.merge(OmegaConf.create(plain(cfg.method.data)), {"num": 2}, data)
     section = OmegaConf.masked_copy(section, ["kind", *READ.get(section.kind, ())])
-    return make_candidates(section, store, scenes, context, model.tokenizer, seed=0, expert=expert)
+    return make_candidates(
+        section, store, Contexts(scenes, model.featurize, episode), model.tokenizer, seed=0, expert=expert
+    )
 
 
 @pytest.mark.parametrize(
@@ -391,14 +394,18 @@ def test_the_log_stands_against_rollouts_that_nothing_ranked(runs: Path, options
     tokenizer, drawn = open_policy(runs / "reference/policy.pt")[0].tokenizer, []
     for row, group in enumerate(pairs_of(runs, options, kind="adversarial", num=3)):
         context = group.context
-        log = tokenizer.encode_tracks(context.logged, context.logged_valid, context.recent, context.kind)
+        log = tokenizer.encode_tracks(
+            context.episode.logged, context.episode.logged_valid, context.episode.recent, context.episode.kind
+        )
         assert all(torch.equal(each, log.tokens) for each in group.preferred) and len(group.preferred) == 3
-        held = store.read([row], num_agents=len(context.kind))[0]
-        assert torch.equal(group.token_valid, held[keys.TOKEN_VALID] & log.valid & context.controlled[:, None])
+        held = store.read([row], num_agents=len(context.episode.kind))[0]
+        assert torch.equal(group.token_valid, held[keys.TOKEN_VALID] & log.valid & context.episode.controlled[:, None])
         ranks = ranks_of(runs, row, group.unpreferred)
         assert len(set(ranks)) == 3, "rollouts of the scene, each once"
         drawn.append(tuple(sorted(ranks)))
-        moved = (log.poses - context.logged)[..., :2].norm(dim=-1)[log.valid.repeat_interleave(tokenizer.steps, -1)]
+        moved = (log.poses - context.episode.logged)[..., :2].norm(dim=-1)[
+            log.valid.repeat_interleave(tokenizer.steps, -1)
+        ]
         assert moved.mean() < 0.5, "tokens of the log drive the log"
     assert len(set(drawn)) > 1, "not always the same ranks"
 
@@ -429,7 +436,7 @@ def numbered(num: int, num_unpreferred: int, sides: str, agents: int = 2) -> Gro
     others = 100 + torch.arange(num_unpreferred)[:, None, None].expand(-1, agents, 16)
     valid = torch.ones(agents, 16, dtype=torch.bool)
     say = rows[:, :, 0] if sides == "pairs" else None
-    return Group(make_context(straight_road(agents)), rows, others, valid, say, sides)
+    return Group(make_context(straight_road(agents), featurize), rows, others, valid, say, sides)
 
 
 def test_pairs_stay_pairs_and_agents_keep_their_say() -> None:
@@ -644,11 +651,11 @@ def test_imitation_logs_how_likely_near_and_far_rollouts_of_its_own_scenes_are(
     cfg = compose_recipe("align", options, runs)
     store, scenes = PreferenceStore(runs / "preferences"), open_splits(cfg.scenes).train
     for policy, place in (("reference", 0), ("sft", -1)):
-        model, context, _ = open_policy((tmp_path if place else runs) / policy / "policy.pt")
+        model, episode, _ = open_policy((tmp_path if place else runs) / policy / "policy.pt")
         loss, found = ContrastivePreferenceLoss(token_network(model.eval())), []
         for row in range(3):
-            seen = make_context(scenes[int(store.scenes[row])], context)
-            stored = store.read([row], num_agents=len(seen.kind))[0]
+            seen = make_context(scenes[int(store.scenes[row])], model.featurize, episode)
+            stored = store.read([row], num_agents=len(seen.episode.kind))[0]
             order = stored[rank_by].argsort()
             near, far = (stored[keys.TOKENS][order[[rank]]] for rank in (0, -1))
             pair = draw_rows(Group(seen, near, far, stored[keys.TOKEN_VALID]), 1, torch.Generator())
@@ -698,8 +705,8 @@ def test_drift_is_measured_from_the_reference_also_in_a_second_round(
     watch = Watch(open_splits(cfg.scenes).tune, tmp_path / "tuned", runs / "reference/policy.pt")
     learnt_from, drift = PreferenceStore(runs / "preferences").provenance, {}
     for name in ("reference", "first"):
-        model, context, _ = open_policy((tmp_path if name == "first" else runs) / name / "policy.pt")
-        drift[name] = Look(watch, context, model, cfg.alignment, learnt_from)("cpu")["tune/kl"]
+        model, episode, _ = open_policy((tmp_path if name == "first" else runs) / name / "policy.pt")
+        drift[name] = Look(watch, episode, model, cfg.alignment, learnt_from)("cpu")["tune/kl"]
     assert drift["reference"] == pytest.approx(0, abs=1e-7) and drift["first"] > 1e-5
 
 
@@ -722,10 +729,10 @@ def test_rollouts_of_other_scenes_are_not_watched(run: Callable, options: Callab
 def test_alignment_learns_from_the_scenes_that_it_is_given(runs: Path, options: Callable) -> None:
     cfg = compose_recipe("align", options, runs)
     store, scenes = PreferenceStore(runs / "preferences"), open_splits(cfg.scenes).train
-    model, context, _ = open_policy(runs / "reference/policy.pt")
+    model, episode, _ = open_policy(runs / "reference/policy.pt")
     data = OmegaConf.merge(cfg.method.data, {"num": 2})
-    every = make_candidates(data, store, scenes, context, model.tokenizer, 0)
-    some = make_candidates(data, store, scenes, context, model.tokenizer, 0, among=[1, 4])
+    every = make_candidates(data, store, Contexts(scenes, model.featurize, episode), model.tokenizer, 0)
+    some = make_candidates(data, store, Contexts(scenes, model.featurize, episode), model.tokenizer, 0, among=[1, 4])
     assert len(every) == 6 and len(some) == 2
     for group, whole in zip(some, (every[1], every[4]), strict=True):
         assert torch.equal(group.preferred, whole.preferred)
@@ -742,10 +749,12 @@ def test_rollouts_that_lack_scenes_to_learn_from_are_refused(runs: Path, options
 def test_rankings_are_thinned_among_the_scenes_that_are_learnt_from(runs: Path, options: Callable) -> None:
     cfg = compose_recipe("align", options, runs)
     store, scenes = PreferenceStore(runs / "preferences"), open_splits(cfg.scenes).train
-    model, context, _ = open_policy(runs / "reference/policy.pt")
+    model, episode, _ = open_policy(runs / "reference/policy.pt")
     data = OmegaConf.merge(cfg.method.data, {"num": 1, "rankings_per_scene": 0.5})
     for seed in range(6):
-        groups = make_candidates(data, store, scenes, context, model.tokenizer, seed, among=[0, 1, 2, 4])
+        groups = make_candidates(
+            data, store, Contexts(scenes, model.featurize, episode), model.tokenizer, seed, among=[0, 1, 2, 4]
+        )
         assert len(groups) == 2, "half a pair of each of the four, whatever the other two would keep"
 
 
@@ -859,7 +868,7 @@ def group_of(num_agents: int) -> Group:
     draw = torch.Generator().manual_seed(num_agents)
     tokens = torch.randint(60, 110, (2, 3, num_agents, 16), generator=draw)
     valid = torch.ones(num_agents, 16, dtype=torch.bool)
-    return Group(make_context(straight_road(num_agents)), tokens[0], tokens[1], valid)
+    return Group(make_context(straight_road(num_agents), featurize), tokens[0], tokens[1], valid)
 
 
 def shake(model: torch.nn.Module) -> None:

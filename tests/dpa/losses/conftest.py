@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from dpa.losses import token_network
-from dpa.policy import SceneContext, collate_contexts, make_context
+from dpa.models import collate_contexts, make_context
+from dpa.models.motionlm import SceneContext, featurize
 from envs.sources.synthetic import straight_road
 
 TOKENS = 5
@@ -43,7 +44,7 @@ def pairs(
     valid[:, :, -1, 1:] = False
     return TensorDict(
         {
-            "context": collate_contexts([make_context(straight_road(agents))] * scenes),
+            "context": collate_contexts([make_context(straight_road(agents), featurize)] * scenes),
             "preferred": torch.randint(TOKENS, shape, generator=generator),
             "unpreferred": torch.randint(TOKENS, other, generator=generator),
             "token_valid": valid,

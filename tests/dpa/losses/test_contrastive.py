@@ -15,7 +15,8 @@ from torch import Tensor
 
 from dpa.losses import ContrastivePreferenceLoss, token_network
 from dpa.losses.contrastive import LINKS
-from dpa.policy import MotionLM, collate_contexts, make_context
+from dpa.models import collate_contexts, make_context
+from dpa.models.motionlm import MotionLM, featurize
 from dpa.tokens import VerletTokenizer
 from dpa.training.checkpoint import capture
 from envs.sources.synthetic import straight_road
@@ -298,7 +299,7 @@ def test_it_trains_a_motion_model() -> None:
     rollouts = torch.randint(60, 100, (2, 1, 4, 2, 16), generator=generator)
     batch = TensorDict(
         {
-            "context": collate_contexts([make_context(straight_road(2))]),
+            "context": collate_contexts([make_context(straight_road(2), featurize)]),
             "preferred": rollouts[0],
             "unpreferred": rollouts[1],
             "token_valid": torch.ones(1, 1, 2, 16, dtype=torch.bool),

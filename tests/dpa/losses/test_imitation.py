@@ -11,7 +11,8 @@ from tensordict import TensorDict
 
 from dpa.losses import ImitationLoss, NextTokenLoss, token_network
 from dpa.losses.network import reference_logits
-from dpa.policy import SIZES, MotionLM, make_context
+from dpa.models import make_context
+from dpa.models.motionlm import SIZES, MotionLM, featurize
 from dpa.tokens import VerletTokenizer
 from dpa.training.batches import collate_items
 from dpa.training.logs import log_item
@@ -51,7 +52,7 @@ def test_the_divergence_is_per_valid_token_from_where_the_policy_began(
 def test_the_copy_is_asked_without_dropout() -> None:
     model = MotionLM(dataclasses.replace(SIZES["nano"], dropout=0.5), VerletTokenizer()).train()
     loss = ImitationLoss(token_network(model))
-    batch = collate_items([log_item(make_context(straight_road(2)), VerletTokenizer())])
+    batch = collate_items([log_item(make_context(straight_road(2), featurize), VerletTokenizer())])
     with torch.no_grad():
         expected = model.eval()(batch["context"], batch["tokens"], batch["token_valid"])
     asked = reference_logits(loss, batch)
@@ -62,7 +63,7 @@ def test_the_copy_is_asked_without_dropout() -> None:
 def test_a_policy_without_dropout_stays_without() -> None:
     model = MotionLM(dataclasses.replace(SIZES["nano"], dropout=0.5), VerletTokenizer()).eval()
     loss = ImitationLoss(token_network(model))
-    batch = collate_items([log_item(make_context(straight_road(2)), VerletTokenizer())])
+    batch = collate_items([log_item(make_context(straight_road(2), featurize), VerletTokenizer())])
     first, second = loss(batch), loss(batch)
     assert first["loss_next_token"] == second["loss_next_token"] and second["kl"] == 0
     assert not any(part.training for part in model.modules())

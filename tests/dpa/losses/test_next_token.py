@@ -9,7 +9,8 @@ import torch
 from tensordict import TensorDict
 
 from dpa.losses import NextTokenLoss, token_network
-from dpa.policy import MotionLM, collate_contexts, make_context
+from dpa.models import collate_contexts, make_context
+from dpa.models.motionlm import MotionLM, featurize
 from dpa.tokens import VerletTokenizer
 from envs.sources.synthetic import straight_road
 
@@ -127,7 +128,7 @@ def road() -> TensorDict:
     """One scene with random tokens."""
     return TensorDict(
         {
-            "context": collate_contexts([make_context(straight_road(3))]),
+            "context": collate_contexts([make_context(straight_road(3), featurize)]),
             "tokens": torch.randint(169, (1, 2, 3, 16), generator=torch.Generator().manual_seed(0)),
             "token_valid": torch.ones(1, 1, 3, 16, dtype=torch.bool),
         },

@@ -9,7 +9,8 @@ import torch
 from tensordict import TensorDict
 
 from dpa.losses import PolicyGradientLoss, token_network
-from dpa.policy import MotionLM, collate_contexts, make_context
+from dpa.models import collate_contexts, make_context
+from dpa.models.motionlm import MotionLM, featurize
 from dpa.tokens import VerletTokenizer
 from envs.sources.synthetic import straight_road
 
@@ -70,7 +71,7 @@ def drawn() -> TensorDict:
     tokens = torch.randint(169, (1, 4, 2, 16), generator=generator)
     return TensorDict(
         {
-            "context": collate_contexts([make_context(straight_road(2))]),
+            "context": collate_contexts([make_context(straight_road(2), featurize)]),
             "tokens": tokens,
             "token_valid": torch.ones(1, 1, 2, 16, dtype=torch.bool),
             "advantage": torch.tensor([1.0, -1.0, 0.5, -0.5])[None, :, None, None],

@@ -13,13 +13,14 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from dpa.policy import MotionLM
+from dpa.models.motionlm import MotionLM
 from dpa.ranking import DisplacementDistance, PreferenceDistance, log_trajectory
 from dpa.realism import realism, realism_of_groups
 from dpa.rewards import REWARDS, Outcome, RealismRanking, RewardRollouts, check_horizon, check_rewards
 from dpa.rollout.job import RolloutJob, RolloutWorker
 from dpa.rollout.plan import RolloutTask
 from dpa.tokens import TokenAction, VerletTokenizer
+from envs.episode import EpisodeOptions
 from envs.scene import Scene
 from envs.sources.synthetic import red_light, straight_road
 from envs.traffic import TrafficEnv
@@ -206,7 +207,8 @@ def test_where_nobody_is_moved_nobody_is_paid() -> None:
     scene = straight_road(3)
     scene.agents.predict[:] = False
     env = TransformedEnv(
-        TrafficEnv([scene], num_scenes=1, num_rollouts=2, control="predict"), TokenAction(VerletTokenizer())
+        TrafficEnv([scene], EpisodeOptions(control="predict"), num_scenes=1, num_rollouts=2),
+        TokenAction(VerletTokenizer()),
     )
     rolled = env.rollout(16)
     rolled["agents", "sampling_log_prob"] = torch.zeros_like(rolled["agents", "token"], dtype=torch.float32)

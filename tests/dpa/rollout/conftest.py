@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dpa.policy import MotionLM, MotionLMConfig
+from dpa.models.motionlm import MotionLM, MotionLMConfig
 from dpa.tokens import VerletTokenizer
 from envs.scene import Scene
 from envs.sources.synthetic import straight_road

@@ -17,15 +17,16 @@ from torch import Tensor
 from torchrl.collectors import BaseCollector
 from torchrl.envs import TransformedEnv
 
-from dpa.policy import ContextOptions, Decoding, MotionActor, MotionLM
-from dpa.policy.actor import Contexts
+from dpa.models import Contexts, Decoding, MotionActor
+from dpa.models.motionlm import MotionLM, featurize
 from dpa.ranking.transform import RankRollouts
-from dpa.rollout import RolloutCollector, Workers, bytes_per_row, make_collector
+from dpa.rollout import RolloutCollector, Workers, make_collector
 from dpa.rollout.collector import agents_of
-from dpa.rollout.plan import GIB
+from dpa.rollout.plan import COLLECTED_BYTES, GIB
 from dpa.rollout.ray_crew import RayCrew
 from dpa.tokens import TokenAction
 from envs import keys
+from envs.episode import EpisodeOptions
 from envs.scene import Scene
 from envs.sources.synthetic import straight_road
 from envs.traffic import TrafficEnv
@@ -36,7 +37,7 @@ PROCESSES = Workers(2, "process")
 
 def budget(model: MotionLM, rows: int) -> float:
     """GiB for so many agents times rollouts."""
-    return (rows + 0.5) * bytes_per_row(model.config, ContextOptions().max_pieces) / GIB
+    return (rows + 0.5) * (model.bytes_per_row() + model.config.horizon * COLLECTED_BYTES) / GIB
 
 
 def tokens_of(batches: Iterable[TensorDictBase], num_rollouts: int) -> dict[int, Tensor]:
@@ -83,7 +84,7 @@ def test_rollouts_are_the_same_however_they_are_cut_up(collect: Callable, rows: 
 def test_rollouts_are_those_of_a_bare_loop(collect: Callable, model: MotionLM, scenes: list[Scene]) -> None:
     for index, tokens in collect().items():
         env = TransformedEnv(TrafficEnv([scenes[index]], num_rollouts=2), TokenAction(model.tokenizer))
-        actor = MotionActor(model.eval(), Contexts([scenes[index]]), num_rollouts=2, decoding=Decoding())
+        actor = MotionActor(model.eval(), Contexts([scenes[index]], featurize), num_rollouts=2, decoding=Decoding())
         assert torch.equal(env.rollout(16, actor)[keys.TOKEN], tokens)
 
 
@@ -98,7 +99,7 @@ def test_the_model_of_the_caller_stays_as_it_is(model: MotionLM, scenes: list[Sc
 def test_arrivals_count_in_the_budget() -> None:
     scene = straight_road(9)
     scene.agents.valid[1:, :30] = False
-    with_them, without = (agents_of([scene], None, ContextOptions(arrivals=arrivals)) for arrivals in (True, False))
+    with_them, without = (agents_of([scene], None, EpisodeOptions(arrivals=arrivals)) for arrivals in (True, False))
     assert (with_them, without) == ({0: 9}, {0: 1})
 
 
@@ -120,7 +121,7 @@ def test_what_is_left_of_an_interrupted_collection_comes_out_as_it_would_have(
 
 
 def test_options_reach_environment_and_policy(model: MotionLM, scenes: list[Scene]) -> None:
-    options = ContextOptions(max_controlled=1, horizon=4)
+    options = EpisodeOptions(max_controlled=1, horizon=4)
     greedy = Decoding(top_p=1e-6)
     (batch,) = make_collector(scenes, model, num_rollouts=2, indices=[2], options=options, decoding=greedy)
     assert batch.batch_size == (2, 4)

@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dpa.policy import SIZES
-from dpa.rollout.plan import bytes_per_row, plan_tasks
+from dpa.models.motionlm import MotionLM
+from dpa.rollout.plan import plan_tasks
+from dpa.tokens import VerletTokenizer
 
 SCENES = st.dictionaries(st.integers(0, 30), st.integers(1, 128), max_size=12)
 
@@ -38,7 +39,8 @@ def test_scenes_of_similar_size_go_together() -> None:
 
 
 def test_a_larger_model_takes_more_memory_per_row() -> None:
-    assert bytes_per_row(SIZES["nano"], 512) < bytes_per_row(SIZES["paper"], 512)
+    small, large = (MotionLM(size, VerletTokenizer()).bytes_per_row() for size in ("nano", "paper"))
+    assert small < large
 
 
 @pytest.mark.parametrize(("num_rollouts", "max_rows"), [(0, 10), (4, 0)])

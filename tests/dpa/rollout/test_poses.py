@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from dpa.policy import MotionLM
+from dpa.models.motionlm import MotionLM
 from dpa.rollout import Subset, lifted, make_collector, simulated_poses
 from envs import keys
 from envs.scene import CURRENT_STEP, Scene

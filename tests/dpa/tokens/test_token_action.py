@@ -9,6 +9,7 @@ from torchrl.envs.utils import check_env_specs
 
 from dpa.tokens import TokenAction, VerletTokenizer
 from envs import keys
+from envs.episode import EpisodeOptions
 from envs.geometry.frames import to_world
 from envs.sources.synthetic import straight_road, two_cars_head_on
 from envs.traffic import TrafficEnv
@@ -16,7 +17,9 @@ from envs.traffic import TrafficEnv
 
 def token_env() -> TransformedEnv:
     scenes = [two_cars_head_on(), straight_road(3)]
-    return TransformedEnv(TrafficEnv(scenes, num_scenes=2, num_rollouts=2, horizon=4), TokenAction(VerletTokenizer()))
+    return TransformedEnv(
+        TrafficEnv(scenes, EpisodeOptions(horizon=4), num_scenes=2, num_rollouts=2), TokenAction(VerletTokenizer())
+    )
 
 
 def test_the_action_is_a_token_for_each_agent() -> None:
@@ -55,7 +58,7 @@ def test_token_environments_can_be_run_side_by_side() -> None:
 
 def test_a_tokenizer_of_another_length_is_refused() -> None:
     env = TransformedEnv(TrafficEnv([straight_road()]), TokenAction(VerletTokenizer(steps=10)))
-    with pytest.raises(ValueError, match=r"takes 5 poses .* gives 10; set TrafficEnv\(decision_steps=10\)"):
+    with pytest.raises(ValueError, match=r"takes 5 poses .* gives 10; say EpisodeOptions\(decision_steps=10\)"):
         env.full_action_spec  # noqa: B018 - specs are made when they are read
 
 

@@ -7,7 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dpa.policy import make_context
+from dpa.models import make_context
+from dpa.models.motionlm import featurize
 from dpa.tokens import VerletTokenizer
 from dpa.training.batches import Item, ShuffledOrder, collate_items, micro_batches
 from dpa.training.logs import log_item
@@ -15,7 +16,7 @@ from envs.sources.synthetic import straight_road
 
 
 def item(num_agents: int, seed: int = 0) -> Item:
-    return log_item(make_context(straight_road(num_agents, seed=seed)), VerletTokenizer())
+    return log_item(make_context(straight_road(num_agents, seed=seed), featurize), VerletTokenizer())
 
 
 # --- order ----------------------------------------------------------------------------------------------------------
@@ -67,12 +68,12 @@ def test_batches_are_padded_with_tokens_that_do_not_count() -> None:
     for row, one in enumerate(items):
         agents = one.tokens.shape[1]
         assert torch.equal(batch["tokens"][row, :, :agents], one.tokens)
-        assert batch["context"].valid[row].tolist() == [True] * agents + [False] * (3 - agents)
+        assert batch["context"].episode.valid[row].tolist() == [True] * agents + [False] * (3 - agents)
 
 
 def test_batches_go_to_a_device_as_a_whole() -> None:
     batch = collate_items([item(1)]).to("meta")
-    assert batch["tokens"].is_meta and batch["context"].recent.is_meta
+    assert batch["tokens"].is_meta and batch["context"].episode.recent.is_meta
 
 
 @settings(max_examples=50, deadline=None)

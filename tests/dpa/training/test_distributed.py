@@ -16,7 +16,8 @@ from torch import distributed, multiprocessing, nn
 from torchrl.objectives import LossModule
 
 from dpa.losses import ContrastivePreferenceLoss, NextTokenLoss, token_network
-from dpa.policy import MotionLM, make_context
+from dpa.models import make_context
+from dpa.models.motionlm import MotionLM, featurize
 from dpa.tokens import VerletTokenizer
 from dpa.training.batches import Item, collate_items
 from dpa.training.distributed import ALONE, VARIABLES, Ranks, join_ranks, started_ranks
@@ -66,7 +67,7 @@ def enter(rank: int, world_size: int, port: int, function: Callable[..., None], 
 @functools.cache
 def item_of(agents: int) -> Item:
     """The log of a road, and the same for nobody."""
-    item = log_item(make_context(straight_road(max(agents, 1), seed=agents)), VerletTokenizer())
+    item = log_item(make_context(straight_road(max(agents, 1), seed=agents), featurize), VerletTokenizer())
     return item if agents else item._replace(token_valid=torch.zeros_like(item.token_valid))
 
 

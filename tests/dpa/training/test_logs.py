@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import fields
 
 import pytest
 import torch
 
-from dpa.policy import ContextOptions, make_context
-from dpa.policy.context import AGENT_FIELDS
+from dpa.models import make_context
+from dpa.models.motionlm import featurize
 from dpa.tokens import VerletTokenizer
 from dpa.training.batches import Item
 from dpa.training.logs import LogItems, choose_agents, log_item, log_items
 from envs.augment import Augmentation
+from envs.episode import Episode, EpisodeOptions
 from envs.loader import SceneLoader
 from envs.scene import Scene
 from envs.seeding import make_generator
@@ -33,7 +35,7 @@ class Counted(list):
 
 
 def logs(scenes: list[Scene] = SCENES, **options: object) -> LogItems:
-    return LogItems(scenes, TOKENIZER, ContextOptions(), **{"max_agents": 4, **options})
+    return LogItems(scenes, TOKENIZER, featurize, EpisodeOptions(), **{"max_agents": 4, **options})
 
 
 def shown(made: LogItems, draws: range | list[int]) -> list[list[Item]]:
@@ -49,11 +51,11 @@ def equal(one: Item, other: Item) -> bool:
 
 
 def test_the_log_is_one_rollout_of_its_scene() -> None:
-    context, tokenizer = make_context(straight_road(2, seed=3)), VerletTokenizer()
+    context, tokenizer = make_context(straight_road(2, seed=3), featurize), VerletTokenizer()
     result = log_item(context, tokenizer)
     assert result.tokens.shape == (1, 2, 16) and result.token_valid.all()
-    poses = tokenizer.decode_tracks(result.tokens[0], context.recent, context.kind)
-    assert (poses - context.logged)[:, 4::5, :2].norm(dim=-1).max() < 0.2
+    poses = tokenizer.decode_tracks(result.tokens[0], context.episode.recent, context.episode.kind)
+    assert (poses - context.episode.logged)[:, 4::5, :2].norm(dim=-1).max() < 0.2
 
 
 def test_agents_that_are_not_controlled_or_leave_the_log_have_no_valid_tokens() -> None:
@@ -61,25 +63,25 @@ def test_agents_that_are_not_controlled_or_leave_the_log_have_no_valid_tokens() 
     valid[1, 31:] = False
     scene = straight_road(3)
     scene.agents = build_scene(scene.agents.poses, [(0, torch.zeros(2, 2))], valid=valid).agents
-    result = log_item(make_context(scene, ContextOptions(max_controlled=2)), VerletTokenizer())
+    result = log_item(make_context(scene, featurize, EpisodeOptions(max_controlled=2)), VerletTokenizer())
     assert result.token_valid.sum(-1).tolist() == [16, 4, 0]
 
 
 def test_logs_side_by_side_are_the_logs_one_by_one() -> None:
-    contexts = [make_context(scene) for scene in SCENES]
+    contexts = [make_context(scene, featurize) for scene in SCENES]
     together = log_items(contexts, TOKENIZER)
     assert all(equal(one, log_item(context, TOKENIZER)) for one, context in zip(together, contexts, strict=True))
 
 
 # --- a crowd --------------------------------------------------------------------------------------------------------
 def test_a_crowd_is_cropped_to_the_agents_around_one_of_them() -> None:
-    crowd = make_context(straight_road(9))
-    x = crowd.recent[choose_agents(crowd, 4, make_generator(0, "crop", 5)), -1, 0]
+    crowd = make_context(straight_road(9), featurize)
+    x = crowd.episode.recent[choose_agents(crowd, 4, make_generator(0, "crop", 5)), -1, 0]
     assert x.shape == (4,) and ((x[:-1] - x[1:]) == 15).all(), "in file, 15 m apart: four neighbours, in order"
 
 
 def test_cropping_depends_on_the_generator_alone() -> None:
-    crowd = make_context(straight_road(9))
+    crowd = make_context(straight_road(9), featurize)
     draws = [choose_agents(crowd, 4, make_generator(0, "crop", step)) for step in (1, 1, 2, 3, 4)]
     assert torch.equal(draws[0], draws[1])
     assert any(not torch.equal(draws[0], other) for other in draws[2:])
@@ -87,17 +89,17 @@ def test_cropping_depends_on_the_generator_alone() -> None:
 
 def test_few_agents_are_left_alone() -> None:
     generator, untouched = make_generator(0), make_generator(0)
-    assert choose_agents(make_context(straight_road(3)), 3, generator) is None
+    assert choose_agents(make_context(straight_road(3), featurize), 3, generator) is None
     assert torch.equal(generator.get_state(), untouched.get_state()), "nothing is drawn"
 
 
 def test_a_cropped_item_is_the_log_of_the_agents_that_are_left() -> None:
     (item,) = shown(logs([SCENES[1]]), [3])[0]
-    whole = log_item(make_context(SCENES[1]), TOKENIZER)
-    rows = [int((whole.context.recent == row).all(-1).all(-1).nonzero()) for row in item.context.recent]
+    whole = log_item(make_context(SCENES[1], featurize), TOKENIZER)
+    rows = [int((whole.context.episode.recent == row).all(-1).all(-1).nonzero()) for row in item.context.episode.recent]
     assert torch.equal(item.tokens, whole.tokens[:, rows]) and torch.equal(item.token_valid, whole.token_valid[rows])
-    for name in AGENT_FIELDS:
-        assert torch.equal(getattr(item.context, name), getattr(whole.context, name)[rows])
+    for name in (field.name for field in fields(Episode)):
+        assert torch.equal(getattr(item.context.episode, name), getattr(whole.context.episode, name)[rows])
 
 
 # --- what is kept ---------------------------------------------------------------------------------------------------
@@ -154,7 +156,7 @@ def test_a_log_is_drawn_as_the_generator_says() -> None:
     assert all(one.tokens.shape == (1, 4, 16) for one in items)
     assert torch.equal(items[0].tokens, items[1].tokens) and torch.equal(items[0].labels, items[1].labels)
     assert not torch.equal(items[0].tokens, items[0].labels), "noise changes tokens and labels lead back"
-    sides = {float(one.context.recent[0, -1, 1].sign()) for one in items}
+    sides = {float(one.context.episode.recent[0, -1, 1].sign()) for one in items}
     assert sides == {-1.0, 1.0}, "some are mirrored"
 
 

@@ -13,11 +13,13 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from dpa.policy import SIZES, ContextOptions, MotionActor, MotionLM, collate_contexts
-from dpa.policy.actor import Contexts, pad_context
-from dpa.policy.sampling import Decoding
+from dpa.models import Contexts, MotionActor, collate_contexts
+from dpa.models.context import pad_context
+from dpa.models.motionlm import SIZES, MotionLM, featurize
+from dpa.models.sampling import Decoding
 from dpa.tokens import TokenAction, VerletTokenizer
 from envs import keys
+from envs.episode import EpisodeOptions
 from envs.scene import Scene
 from envs.sources.synthetic import straight_road
 from envs.traffic import TrafficEnv
@@ -34,17 +36,19 @@ def scenes(scene: Callable[..., Scene]) -> list[Scene]:
 
 def drive(model: MotionLM, scenes: list[Scene], **options: Any) -> tuple[TransformedEnv, MotionActor]:
     """Environment and actor of two scenes at a time, two rollouts each."""
-    env = TrafficEnv(scenes, num_scenes=2, num_rollouts=2, max_controlled=LIMIT)
-    actor = MotionActor(model, Contexts(scenes, ContextOptions(max_controlled=LIMIT)), num_rollouts=2, **options)
+    env = TrafficEnv(scenes, EpisodeOptions(max_controlled=LIMIT), num_scenes=2, num_rollouts=2)
+    actor = MotionActor(
+        model, Contexts(scenes, featurize, EpisodeOptions(max_controlled=LIMIT)), num_rollouts=2, **options
+    )
     return TransformedEnv(env, TokenAction(model.tokenizer)), actor
 
 
 @torch.no_grad()
 def teacher_forced(model: MotionLM, scenes: list[Scene], scene: Tensor, tokens: Tensor) -> Tensor:
     """``[B, A, T]`` log-probabilities of whole rollouts ``[B, A, T]``, each row with its scene."""
-    contexts = Contexts(scenes, ContextOptions(max_controlled=LIMIT))
+    contexts = Contexts(scenes, featurize, EpisodeOptions(max_controlled=LIMIT))
     context = pad_context(collate_contexts([contexts[i] for i in scene.tolist()]), tokens.shape[1])
-    valid = context.controlled[:, None, :, None].expand(-1, 1, -1, tokens.shape[-1])
+    valid = context.episode.controlled[:, None, :, None].expand(-1, 1, -1, tokens.shape[-1])
     log_probs = model(context, tokens[:, None], valid).log_softmax(-1)
     return log_probs.gather(-1, tokens[:, None, ..., None])[:, 0, ..., 0]
 
@@ -62,7 +66,7 @@ def test_a_decision_out_of_turn_is_refused(model: MotionLM, scenes: list[Scene])
 
 
 def test_the_contexts_used_last_are_kept() -> None:
-    contexts = Contexts([straight_road(count) for count in (1, 2, 3)], most=2)
+    contexts = Contexts([straight_road(count) for count in (1, 2, 3)], featurize, most=2)
     first, _, again = contexts[0], contexts[1], contexts[0]
     assert again is first
     contexts[2]
@@ -190,8 +194,10 @@ def tokens_of(model: MotionLM, scenes: list[Scene], order: list[int], **options:
     """Tokens ``[T, A]`` of all rollouts by scene and number, of scenes rolled out together in some order."""
     rollouts, first = options.pop("num_rollouts", 2), options.pop("first_rollout", 0)
     chosen = [scenes[index] for index in order]
-    env = TrafficEnv(chosen, num_scenes=len(chosen), num_rollouts=rollouts, max_controlled=LIMIT, **options)
-    contexts = Contexts(chosen, ContextOptions(max_controlled=LIMIT))
+    env = TrafficEnv(
+        chosen, EpisodeOptions(max_controlled=LIMIT), num_scenes=len(chosen), num_rollouts=rollouts, **options
+    )
+    contexts = Contexts(chosen, featurize, EpisodeOptions(max_controlled=LIMIT))
     actor = MotionActor(model, contexts, num_rollouts=rollouts, first_rollout=first, seed=7)
     rollout = TransformedEnv(env, TokenAction(model.tokenizer)).rollout(16, actor)
     return {
@@ -221,7 +227,7 @@ def test_a_rollout_depends_on_scene_number_and_seed_and_not_on_its_batch(
 
 def test_a_rollout_that_is_begun_again_comes_out_anew(model: MotionLM, scenes: list[Scene]) -> None:
     env = TransformedEnv(TrafficEnv(scenes[:1], num_rollouts=2), TokenAction(model.tokenizer))
-    actor = MotionActor(model, Contexts(scenes[:1]), num_rollouts=2)
+    actor = MotionActor(model, Contexts(scenes[:1], featurize), num_rollouts=2)
     first, second = (env.rollout(16, actor)[keys.TOKEN] for _ in range(2))
     assert not torch.equal(first, second)
     actor.set_seed(0)
@@ -268,7 +274,7 @@ def test_a_compiled_decoder_gives_the_same_log_probs_and_tokens(model: MotionLM,
 
 def test_an_unknown_precision_is_refused(model: MotionLM) -> None:
     with pytest.raises(ValueError, match="precision must be one of float32, bfloat16, got 'float8'"):
-        MotionActor(model, Contexts([straight_road()]), precision="float8")
+        MotionActor(model, Contexts([straight_road()], featurize), precision="float8")
 
 
 # --- errors ---------------------------------------------------------------------------------------------------------
@@ -276,13 +282,13 @@ def test_another_number_of_rollouts_than_the_environment_has_is_refused(model: M
     scenes = [straight_road()]
     env = TransformedEnv(TrafficEnv(scenes, num_rollouts=3), TokenAction(model.tokenizer))
     with pytest.raises(ValueError, match="num_rollouts must divide the batch of 3 rows, got 2"):
-        MotionActor(model, Contexts(scenes), num_rollouts=2)(env.reset())
+        MotionActor(model, Contexts(scenes, featurize), num_rollouts=2)(env.reset())
 
 
 def test_groups_of_one_batch_that_show_one_scene_differ(model: MotionLM) -> None:
     scenes = [straight_road(3)]
     env = TransformedEnv(TrafficEnv(scenes, num_scenes=2, num_rollouts=2), TokenAction(model.tokenizer))
-    actor = MotionActor(model, Contexts(scenes), num_rollouts=2)
+    actor = MotionActor(model, Contexts(scenes, featurize), num_rollouts=2)
     tokens = env.rollout(16, actor)[keys.TOKEN].flatten(1)
     assert len(tokens.unique(dim=0)) == 4
     again = env.rollout(16, actor)[keys.TOKEN].flatten(1)
@@ -301,15 +307,15 @@ def test_the_mode_is_the_most_probable_token(model: MotionLM, scenes: list[Scene
 def test_contexts_of_other_agents_are_refused(model: MotionLM) -> None:
     scene = straight_road(3)
     scene.agents.valid[1, :30] = False
-    env = TransformedEnv(TrafficEnv([scene], arrivals=True), TokenAction(model.tokenizer))
+    env = TransformedEnv(TrafficEnv([scene], EpisodeOptions(arrivals=True)), TokenAction(model.tokenizer))
     with pytest.raises(ValueError, match="differ in 'kind' .* give both the same scenes, arrivals"):
-        env.rollout(1, MotionActor(model, Contexts([scene])))
+        env.rollout(1, MotionActor(model, Contexts([scene], featurize)))
 
 
 def test_contexts_of_other_scenes_are_refused(model: MotionLM) -> None:
     env = TransformedEnv(TrafficEnv([straight_road(1)]), TokenAction(model.tokenizer))
     with pytest.raises(ValueError, match="contexts hold 3 agents and the environment 1"):
-        MotionActor(model, Contexts([straight_road(3)]))(env.reset())
+        MotionActor(model, Contexts([straight_road(3)], featurize))(env.reset())
 
 
 if __name__ == "__main__":

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
-from dpa.policy import ContextOptions, MotionActor, MotionLM, collate_contexts, make_context
-from dpa.policy.actor import Contexts, pad_context
+from dpa.models import Contexts, MotionActor, collate_contexts, make_context
+from dpa.models.context import pad_context
+from dpa.models.motionlm import MotionLM, featurize
 from dpa.ranking.transform import RankRollouts
 from dpa.tokens import TokenAction
 from dpa.training.logs import log_item
 from envs import keys
+from envs.episode import EpisodeOptions
 from envs.scene import CURRENT_STEP, Scene
 from envs.traffic import TrafficEnv
 
@@ -48,9 +51,10 @@ def scenes(scene: Callable[..., Scene]) -> list[Scene]:
 
 
 def drive(model: MotionLM, scenes: list[Scene], **options: object) -> TensorDictBase:
-    env = TrafficEnv(scenes, num_scenes=3, num_rollouts=2, **options)
-    actor = MotionActor(model, Contexts(scenes, ContextOptions(**options)), num_rollouts=2)
-    return TransformedEnv(env, TokenAction(model.tokenizer)).rollout(env.horizon, actor)
+    episode = EpisodeOptions(**options)
+    env = TrafficEnv(scenes, episode, num_scenes=3, num_rollouts=2)
+    actor = MotionActor(model, Contexts(scenes, featurize, episode), num_rollouts=2)
+    return TransformedEnv(env, TokenAction(model.tokenizer)).rollout(episode.horizon, actor)
 
 
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
@@ -60,59 +64,62 @@ def test_cached_log_probs_equal_those_of_one_teacher_forced_pass(
 ) -> None:
     steps, horizon = options.get("decision_steps", 5), options.get("horizon", 16)
     if steps != model.tokenizer.steps:
-        model = MotionLM(
-            type(model.config)(**{**model.config.as_dict(), "horizon": horizon}), type(model.tokenizer)(steps=steps)
-        )
+        model = MotionLM(replace(model.config, horizon=horizon), type(model.tokenizer)(steps=steps))
     rollout = drive(model.eval(), scenes, **options)
-    contexts = Contexts(scenes, ContextOptions(**options))
+    contexts = Contexts(scenes, featurize, EpisodeOptions(**options))
     context = pad_context(
         collate_contexts([contexts[i] for i in rollout[keys.SCENE][:, 0].tolist()]), rollout[keys.TOKEN].shape[-1]
     )
-    assert torch.equal(context.controlled, rollout[keys.CONTROLLED][:, 0])
-    assert torch.equal(context.valid, rollout[keys.VALID][:, 0])
+    assert torch.equal(context.episode.controlled, rollout[keys.CONTROLLED][:, 0])
+    assert torch.equal(context.episode.valid, rollout[keys.VALID][:, 0])
     tokens = rollout[keys.TOKEN].transpose(1, 2)
-    valid = context.controlled[:, None, :, None].expand(-1, 1, -1, horizon)
+    valid = context.episode.controlled[:, None, :, None].expand(-1, 1, -1, horizon)
     log_probs = model(context, tokens[:, None], valid).log_softmax(-1)
     expected = log_probs.gather(-1, tokens[:, None, ..., None])[:, 0, ..., 0]
-    written, controlled = rollout[keys.LOG_PROB].transpose(1, 2), context.controlled
+    written, controlled = rollout[keys.LOG_PROB].transpose(1, 2), context.episode.controlled
     assert controlled.any(-1).all()
     torch.testing.assert_close(written[controlled], expected[controlled], atol=1e-5, rtol=1e-5)
 
 
 @torch.no_grad()
 def test_an_arrival_is_seen_from_its_first_decision_on_and_not_before(model: MotionLM, scenes: list[Scene]) -> None:
-    options = ContextOptions(arrivals=True)
-    seen, unseen = (make_context(scene, options) for scene in (scenes[0], scenes[0].clone()))
-    late = int((~seen.valid).nonzero()[0])
-    first = int(seen.logged_valid[late].int().argmax()) // 5
-    unseen.logged_valid[late] = False
-    tokens, valid = torch.full((1, 1, len(seen.kind), 16), 84), torch.ones(1, 1, 1, 16, dtype=torch.bool)
-    left, right = (model(collate_contexts([each]), tokens, valid)[0, 0, seen.controlled] for each in (seen, unseen))
+    options = EpisodeOptions(arrivals=True)
+    seen, unseen = (make_context(scene, featurize, options) for scene in (scenes[0], scenes[0].clone()))
+    late = int((~seen.episode.valid).nonzero()[0])
+    first = int(seen.episode.logged_valid[late].int().argmax()) // 5
+    unseen.episode.logged_valid[late] = False
+    tokens, valid = torch.full((1, 1, len(seen.episode.kind), 16), 84), torch.ones(1, 1, 1, 16, dtype=torch.bool)
+    left, right = (
+        model(collate_contexts([each]), tokens, valid)[0, 0, seen.episode.controlled] for each in (seen, unseen)
+    )
     differs = (left - right).abs().amax((0, 2)) > 0
     assert first == 2, "at step 23, in the decision that begins with step 21 and ends with step 25"
     assert not differs[: first + 1].any() and differs[first + 1]
 
 
 def test_arrivals_take_nothing_from_the_context_of_those_who_are_there(scenes: list[Scene]) -> None:
-    without, with_them = make_context(scenes[0]), make_context(scenes[0], ContextOptions(arrivals=True))
-    present = len(without.kind)
-    assert len(with_them.kind) == present + 2
+    without, with_them = (
+        make_context(scenes[0], featurize),
+        make_context(scenes[0], featurize, EpisodeOptions(arrivals=True)),
+    )
+    present = len(without.episode.kind)
+    assert len(with_them.episode.kind) == present + 2
     for name in ("map_pose", "map_points", "light_pose"):
         assert torch.equal(getattr(with_them, name), getattr(without, name))
     for name in ("history", "recent", "logged", "controlled", "valid"):
-        assert torch.equal(getattr(with_them, name)[:present], getattr(without, name))
+        assert torch.equal(getattr(with_them.episode, name)[:present], getattr(without.episode, name))
 
 
 def test_arrivals_are_no_labels(model: MotionLM, scenes: list[Scene]) -> None:
-    item = log_item(make_context(scenes[2], ContextOptions(arrivals=True)), model.tokenizer)
-    assert item.context.logged_valid[-1].any() and not item.token_valid[-2:].any()
+    item = log_item(make_context(scenes[2], featurize, EpisodeOptions(arrivals=True)), model.tokenizer)
+    assert item.context.episode.logged_valid[-1].any() and not item.token_valid[-2:].any()
     assert not scenes[2].agents.valid[[2, 4], CURRENT_STEP].any()
 
 
 def test_arrivals_take_no_part_in_the_ranking(model: MotionLM, scenes: list[Scene]) -> None:
     ranked = []
     for arrivals in (False, True):
-        env = TrafficEnv(scenes, num_scenes=3, num_rollouts=2, arrivals=arrivals)
+        env = TrafficEnv(scenes, EpisodeOptions(arrivals=arrivals), num_scenes=3, num_rollouts=2)
         env = TransformedEnv(env, TokenAction(model.tokenizer))
         generator, state, steps = torch.Generator().manual_seed(0), env.reset(), []
         for _ in range(16):
@@ -129,7 +136,7 @@ def test_arrivals_take_no_part_in_the_ranking(model: MotionLM, scenes: list[Scen
 
 def test_a_control_that_is_none_is_refused() -> None:
     with pytest.raises(ValueError, match=r"control must be one of \['all', 'sdc', 'predict'\] .*, got 'ego'"):
-        ContextOptions(control="ego")
+        EpisodeOptions(control="ego")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from dpa.policy import MotionLM, MotionLMConfig
+from dpa.models.motionlm import MotionLM, MotionLMConfig
 from dpa.tokens import VerletTokenizer
 from envs.geometry.frames import rotate, to_world
 from envs.scene import AgentKind, Lights, LightState, MapKind, Scene

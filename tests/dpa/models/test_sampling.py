@@ -7,7 +7,7 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from dpa.policy.sampling import Decoding, draw, rollout_noise
+from dpa.models.sampling import Decoding, draw, rollout_noise
 
 
 def cut_by_hand(probs: list[float], decoding: Decoding) -> list[float]:

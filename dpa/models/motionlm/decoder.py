@@ -12,9 +12,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from dpa.policy.attention import GAZE, FeedForward, KeyValues, NodeAttention, NodeMasks, RelativeAttention, added
-from dpa.policy.encoder import LENGTH_SCALE, SceneTokens
-from dpa.policy.vicinity import Vicinity
+from dpa.models.motionlm.attention import (
+    GAZE,
+    FeedForward,
+    KeyValues,
+    NodeAttention,
+    NodeMasks,
+    RelativeAttention,
+    added,
+)
+from dpa.models.motionlm.encoder import LENGTH_SCALE, SceneTokens
+from dpa.models.motionlm.vicinity import Vicinity
 from envs.geometry.frames import rotate, wrap_angle
 from envs.scene import AgentKind
 

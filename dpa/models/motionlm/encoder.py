@@ -7,8 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from dpa.policy.attention import FeedForward, RelativeAttention
-from dpa.policy.context import HISTORY, NUM_LIGHT_STATES, PIECE_POINTS, POSITION_SCALE, SceneContext
+from dpa.models.motionlm.attention import FeedForward, RelativeAttention
+from dpa.models.motionlm.context import NUM_LIGHT_STATES, PIECE_POINTS, POSITION_SCALE, SceneContext
+from envs.episode import HISTORY, Episode
 from envs.scene import NUM_MAP_KINDS, AgentKind
 
 LENGTH_SCALE = 5.0
@@ -53,7 +54,7 @@ class EncoderLayer(nn.Module):
 
 
 class SceneEncoder(nn.Module):
-    """Encodes a :class:`~dpa.policy.context.SceneContext`.
+    """Encodes a :class:`~dpa.models.motionlm.context.SceneContext`.
 
     Args:
         width: channels of a token.
@@ -63,9 +64,11 @@ class SceneEncoder(nn.Module):
         dropout: on both branches of a layer.
 
     Examples:
-        >>> from dpa.policy.context import collate_contexts, make_context
+        >>> from dpa.models.context import collate_contexts, make_context
+        >>> from dpa.models.motionlm.context import featurize
         >>> from envs.sources.synthetic import straight_road
-        >>> SceneEncoder(32, 2, 64, 1)(collate_contexts([make_context(straight_road(2))])).agents.shape
+        >>> context = make_context(straight_road(2), featurize)
+        >>> SceneEncoder(32, 2, 64, 1)(collate_contexts([context])).agents.shape
         torch.Size([1, 2, 32])
     """
 
@@ -84,10 +87,11 @@ class SceneEncoder(nn.Module):
 
     def forward(self, context: SceneContext) -> SceneTokens:
         """Encode scenes of batch size ``[S]``."""
-        x = torch.cat((self._map(context), self._lights(context), self._agents(context)), 1)
-        current = context.recent[:, :, -1]
+        episode = context.episode
+        x = torch.cat((self._map(context), self._lights(context), self._agents(episode)), 1)
+        current = episode.recent[:, :, -1]
         pose = torch.cat((context.map_pose, context.light_pose, current), 1)
-        valid = torch.cat((context.map_valid, context.light_valid, context.valid), 1)
+        valid = torch.cat((context.map_valid, context.light_valid, episode.valid), 1)
         for layer in self.layers:
             x = layer(x, pose, valid[:, None, None, :])
         return SceneTokens(self.norm(x), pose, valid, current.shape[1])
@@ -100,11 +104,11 @@ class SceneEncoder(nn.Module):
         history = self.light_state(context.light_state)
         return history[..., -1, :] + (history * self.light_time).sum(-2) + self.light_token
 
-    def _agents(self, context: SceneContext) -> Tensor:
-        past = torch.cat((context.history[..., :2] / POSITION_SCALE, context.history[..., 2:]), -1)
-        seen = context.history_valid[..., None].to(past.dtype)
-        features = torch.cat((torch.cat((past, seen), -1).flatten(-2), context.extent / LENGTH_SCALE), -1)
-        return self.agent_features(features) + self.agent_kind(context.kind)
+    def _agents(self, episode: Episode) -> Tensor:
+        past = torch.cat((episode.history[..., :2] / POSITION_SCALE, episode.history[..., 2:]), -1)
+        seen = episode.history_valid[..., None].to(past.dtype)
+        features = torch.cat((torch.cat((past, seen), -1).flatten(-2), episode.extent / LENGTH_SCALE), -1)
+        return self.agent_features(features) + self.agent_kind(episode.kind)
 
 
 def _mlp(inputs: int, width: int) -> nn.Sequential:

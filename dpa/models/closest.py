@@ -6,8 +6,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from dpa.policy.actor import Contexts, MotionActor
-from dpa.policy.motionlm import MotionLM
+from dpa.models.actor import MotionActor
+from dpa.models.base import MotionModel
+from dpa.models.context import Contexts
 from envs import keys
 from envs.geometry.boxes import box_corners
 from envs.geometry.frames import beside, to_local
@@ -37,23 +38,24 @@ class ClosestActor(MotionActor):
     Raises:
         ValueError: no such number of tokens, or no such share.
 
-    Beside what a :class:`~dpa.policy.MotionActor` writes stand ``label`` and ``label_valid`` of each agent. Nothing is
+    Beside what a :class:`~dpa.models.MotionActor` writes stand ``label`` and ``label_valid`` of each agent. Nothing is
     drawn; ``sampling_log_prob`` is 0.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
+        >>> from dpa.models.motionlm import MotionLM
         >>> from dpa.tokens import TokenAction, VerletTokenizer
         >>> from envs.sources.synthetic import straight_road
         >>> from envs.traffic import TrafficEnv
-        >>> scenes, tokenizer = [straight_road(2)], VerletTokenizer()
-        >>> env = TransformedEnv(TrafficEnv(scenes), TokenAction(tokenizer))
-        >>> actor = ClosestActor(MotionLM("nano", tokenizer), Contexts(scenes), candidates=169)
+        >>> scenes, model = [straight_road(2)], MotionLM("nano", VerletTokenizer())
+        >>> env = TransformedEnv(TrafficEnv(scenes), TokenAction(model.tokenizer))
+        >>> actor = ClosestActor(model, Contexts(scenes, model.featurize), candidates=169)
         >>> followed = env.rollout(16, actor)
         >>> (followed["agents", "token"] == followed["agents", "label"]).float().mean() > 0.8
         tensor(True)
     """
 
-    def __init__(self, model: MotionLM, contexts: Contexts, *, candidates: int = 32, recovery: float = 1.0) -> None:
+    def __init__(self, model: MotionModel, contexts: Contexts, *, candidates: int = 32, recovery: float = 1.0) -> None:
         super().__init__(model, contexts)
         if not 1 <= candidates <= model.tokenizer.vocab_size:
             raise ValueError(
@@ -86,7 +88,10 @@ class ClosestActor(MotionActor):
     def _target(self, step: Tensor, recent: Tensor) -> tuple[Tensor, Tensor]:
         """``[B, A, F, 3]``: where to be, in the agents' own frames; ``[B, A]``: the log knows the decision's end."""
         steps, rows = self.model.tokenizer.steps, torch.arange(len(step), device=step.device) // self.num_rollouts
-        decisions = (each.unflatten(2, (-1, steps)) for each in (self._context.logged, self._context.logged_valid))
+        decisions = (
+            each.unflatten(2, (-1, steps))
+            for each in (self._context.episode.logged, self._context.episode.logged_valid)
+        )
         (logged, valid), before = decisions, (step - 1).clamp(min=0)  # [S, A, T, F, ...]
         poses, current = logged[rows, :, step], recent[..., -1, :]
         # Nothing is left of the offset where the log had no pose to be beside, nor before the first decision.
@@ -96,7 +101,7 @@ class ClosestActor(MotionActor):
 
     def _apart(self, tokens: Tensor, target: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
         """``[B, A, K]``: mean distance of the box's corners at the ends of tokens from those at the target [m]."""
-        size = self._context.extent[..., None, :2].repeat_interleave(self.num_rollouts, 0)
+        size = self._context.episode.extent[..., None, :2].repeat_interleave(self.num_rollouts, 0)
         many = tokens.shape[-1]
         ends = self.model.tokenizer.decode(
             tokens, recent[:, :, None].expand(-1, -1, many, -1, -1), kind[..., None].expand_as(tokens)

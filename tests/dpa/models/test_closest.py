@@ -8,9 +8,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from dpa.policy import MotionLM, SceneContext, make_context
-from dpa.policy.actor import Contexts
-from dpa.policy.closest import ClosestActor
+from dpa.models import Contexts, make_context
+from dpa.models.closest import ClosestActor
+from dpa.models.motionlm import MotionLM, SceneContext, featurize
 from dpa.tokens import TokenAction, VerletTokenizer
 from dpa.training.logs import log_item
 from envs import keys
@@ -31,7 +31,7 @@ def policy() -> MotionLM:
 def followed(scenes: list[Scene], candidates: int, num_rollouts: int = 1, recovery: float = 1.0) -> TensorDictBase:
     sizes = {"num_scenes": len(scenes), "num_rollouts": num_rollouts}
     env = TransformedEnv(TrafficEnv(scenes, **sizes), TokenAction(TOKENIZER))
-    actor = ClosestActor(policy(), Contexts(scenes), candidates=candidates, recovery=recovery)
+    actor = ClosestActor(policy(), Contexts(scenes, featurize), candidates=candidates, recovery=recovery)
     actor.num_rollouts = num_rollouts
     return env.rollout(16, actor)
 
@@ -41,15 +41,15 @@ def test_among_all_tokens_the_log_is_followed_as_by_its_own_tokens() -> None:
     rolled = followed([scene], candidates=169)
     tokens = rolled[keys.TOKEN][0].T
     assert torch.equal(tokens, rolled[keys.LABEL][0].T), "the nearest of all is the label"
-    assert torch.equal(tokens, log_item(make_context(scene), TOKENIZER).tokens[0])
+    assert torch.equal(tokens, log_item(make_context(scene, featurize), TOKENIZER).tokens[0])
 
 
 def test_of_one_candidate_the_most_probable_is_taken_and_the_label_still_leads_back() -> None:
     scene = straight_road(2)
     rolled = followed([scene], candidates=1)
-    start = make_context(scene)
-    log = (start.logged[:, 4] - start.recent[:, -1])[:, :2].norm(dim=-1)
-    ends = TOKENIZER.decode(rolled[keys.LABEL][0, 0], start.recent, start.kind)[:, -1, :2].norm(dim=-1)
+    start = make_context(scene, featurize)
+    log = (start.episode.logged[:, 4] - start.episode.recent[:, -1])[:, :2].norm(dim=-1)
+    ends = TOKENIZER.decode(rolled[keys.LABEL][0, 0], start.episode.recent, start.episode.kind)[:, -1, :2].norm(dim=-1)
     torch.testing.assert_close(ends, log, atol=0.15, rtol=0)
     assert (rolled[keys.TOKEN] != rolled[keys.LABEL]).any()
 
@@ -58,8 +58,12 @@ def apart(context: SceneContext, agent: int, tokens: Tensor) -> Tensor:
     """How far the box of an agent ends from that of the log after its first decision, by hand: ``[n]``."""
     found = []
     for token in tokens:
-        end = TOKENIZER.advance(token[None], context.recent[agent][None], context.kind[agent][None])[0, -1]
-        boxes = (torch.cat((pose, context.extent[agent, :2])) for pose in (end, context.logged[agent, 4]))
+        end = TOKENIZER.advance(token[None], context.episode.recent[agent][None], context.episode.kind[agent][None])[
+            0, -1
+        ]
+        boxes = (
+            torch.cat((pose, context.episode.extent[agent, :2])) for pose in (end, context.episode.logged[agent, 4])
+        )
         mine, logs = (box_corners(box) for box in boxes)
         found.append((mine - logs).norm(dim=-1).mean())
     return torch.stack(found)
@@ -69,9 +73,9 @@ def test_the_label_is_taken_where_it_is_likely_and_otherwise_the_likely_token_th
     inside = outside = 0
     for seed, candidates in ((0, 20), (1, 20), (0, 120), (1, 120)):
         scene = straight_road(3, seed=seed)
-        rolled, context = followed([scene], candidates=candidates), make_context(scene)
+        rolled, context = followed([scene], candidates=candidates), make_context(scene, featurize)
         env = TransformedEnv(TrafficEnv([scene]), TokenAction(TOKENIZER))
-        logits = ClosestActor(policy(), Contexts([scene])).logits(env.reset())
+        logits = ClosestActor(policy(), Contexts([scene], featurize)).logits(env.reset())
         likely = logits.topk(candidates).indices[0]
         for agent in range(3):
             token, label = (rolled[key][0, 0, agent] for key in (keys.TOKEN, keys.LABEL))
@@ -86,11 +90,11 @@ def test_the_label_is_taken_where_it_is_likely_and_otherwise_the_likely_token_th
 
 def test_a_likely_label_is_taken_though_the_box_of_another_token_ends_nearer() -> None:
     """The tokenizer goes by where the centre ends; the corners of a turning car may say otherwise."""
-    scene, context = straight_road(1, seed=0), make_context(straight_road(1, seed=0))
-    context.logged[0, 4, 2] += 0.8  # of the log's last pose, the heading alone
+    scene, context = straight_road(1, seed=0), make_context(straight_road(1, seed=0), featurize)
+    context.episode.logged[0, 4, 2] += 0.8  # of the log's last pose, the heading alone
     distances = apart(context, 0, torch.arange(169))
-    target = to_local(context.logged[:, :5], context.recent[:, -1:])
-    label = TOKENIZER.encode(target, context.recent, context.kind)[0]
+    target = to_local(context.episode.logged[:, :5], context.episode.recent[:, -1:])
+    label = TOKENIZER.encode(target, context.episode.recent, context.episode.kind)[0]
     assert distances.argmin() != label, "the case that is meant"
     scene.agents.heading[0, CURRENT_STEP + 5] += 0.8
     assert followed([scene], candidates=169)[keys.TOKEN][0, 0, 0] == label
@@ -98,13 +102,13 @@ def test_a_likely_label_is_taken_though_the_box_of_another_token_ends_nearer() -
 
 def test_slow_recovery_aims_at_the_log_moved_by_what_is_left_of_the_offset() -> None:
     """By hand, for the second decision: the target lies beside the log's next pose as the agent lies beside the log."""
-    scene, context = straight_road(3, seed=5), make_context(straight_road(3, seed=5))
+    scene, context = straight_road(3, seed=5), make_context(straight_road(3, seed=5), featurize)
     rolled = followed([scene], candidates=2, recovery=0.25)
     for agent in range(3):
-        recent, kind = context.recent[agent], context.kind[agent]
+        recent, kind = context.episode.recent[agent], context.episode.kind[agent]
         recent = TOKENIZER.advance(rolled[keys.TOKEN][0, 0, agent][None], recent[None], kind[None])[0]
-        offset = to_local(recent[-1], context.logged[agent, 4])
-        target = to_world(0.75 * offset, context.logged[agent, 5:10])
+        offset = to_local(recent[-1], context.episode.logged[agent, 4])
+        target = to_world(0.75 * offset, context.episode.logged[agent, 5:10])
         label = TOKENIZER.encode(to_local(target, recent[-1])[None], recent[None], kind[None])
         assert rolled[keys.LABEL][0, 1, agent] == label
 
@@ -112,7 +116,7 @@ def test_slow_recovery_aims_at_the_log_moved_by_what_is_left_of_the_offset() -> 
 @pytest.mark.parametrize("recovery", [0.0, 1.5])
 def test_a_share_that_cannot_be_made_good_is_refused(recovery: float) -> None:
     with pytest.raises(ValueError, match=rf"recovery must lie in \(0, 1\], got {recovery}"):
-        ClosestActor(policy(), Contexts([straight_road(1)]), recovery=recovery)
+        ClosestActor(policy(), Contexts([straight_road(1)], featurize), recovery=recovery)
 
 
 def test_where_the_log_ends_the_most_probable_token_is_taken_and_there_is_no_label() -> None:
@@ -124,7 +128,7 @@ def test_where_the_log_ends_the_most_probable_token_is_taken_and_there_is_no_lab
     assert rolled[keys.LABEL_VALID][0].sum(0).tolist() == [16, 4]
     log_prob = rolled[keys.LOG_PROB][0, :, 1]
     env = TransformedEnv(TrafficEnv([scene]), TokenAction(TOKENIZER))
-    likeliest = env.rollout(16, ClosestActor(policy(), Contexts([scene]), candidates=1))
+    likeliest = env.rollout(16, ClosestActor(policy(), Contexts([scene], featurize), candidates=1))
     assert (log_prob[4:] > -torch.log(torch.tensor(169.0))).all(), "more probable than the mean"
     assert likeliest[keys.LABEL_VALID][0].sum(0).tolist() == [16, 4]
 
@@ -157,7 +161,7 @@ def test_several_rollouts_of_a_scene_are_one_and_the_same() -> None:
 @pytest.mark.parametrize("candidates", [0, 170])
 def test_a_number_of_candidates_that_cannot_be_is_refused(candidates: int) -> None:
     with pytest.raises(ValueError, match=f"candidates must be 1 to 169, the number of tokens, got {candidates}"):
-        ClosestActor(policy(), Contexts([straight_road(1)]), candidates=candidates)
+        ClosestActor(policy(), Contexts([straight_road(1)], featurize), candidates=candidates)
 
 
 if __name__ == "__main__":

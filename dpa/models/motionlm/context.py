@@ -1,4 +1,4 @@
-"""What the policy sees of a scene: map pieces, lights and histories, each in a frame of its own.
+"""What MotionLM sees of a scene: map pieces and lights, and its agents' histories, each in a frame of its own.
 
 Long polylines are cut into pieces of about ten metres. A piece, a light or an agent is a pose plus features measured
 from that pose, so nothing here depends on where the scene lies or how it is turned (but for which of the farthest
@@ -7,21 +7,19 @@ pieces are seen, where there are more than ``max_pieces``).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from tensordict import TensorClass
 from torch import Tensor
-from torch.nn.utils.rnn import pad_sequence
 
-from envs.geometry.frames import rotate, to_local, wrap_angle
-from envs.participants import MAX_CONTROLLED, Control, check_control, choose_controlled, simulated_agents
-from envs.scene import CURRENT_STEP, LOG_STEPS, STEP_SECONDS, Agents, Lights, LightState, RoadMap, Scene, check_episode
+from envs.episode import HISTORY, Episode
+from envs.geometry.frames import rotate, wrap_angle
+from envs.scene import CURRENT_STEP, LOG_STEPS, STEP_SECONDS, Agents, Lights, LightState, RoadMap, Scene
 
 PIECE_POINTS = 5
 """Points that describe a piece."""
-HISTORY = CURRENT_STEP + 1
 POSITION_SCALE = 10.0
 """Metres that count as one in a feature."""
 REACH_GRID = 4.0
@@ -31,41 +29,30 @@ NUM_LIGHT_STATES = len(LightState)
 
 @dataclass(frozen=True)
 class ContextOptions:
-    """How a scene is cut up for the policy.
+    """How a scene is cut up for MotionLM.
 
     Attributes:
         max_pieces: map pieces kept, those nearest to where any present agent is or may soon be.
         piece_length: target length of a map piece [m].
-        max_controlled: agents that the policy moves at most.
-        decision_steps: F.
-        horizon: T.
-        control: whom the policy may move, as in :class:`~envs.traffic.TrafficEnv`.
-        arrivals: agents that the log brings in later take part, as in :class:`~envs.traffic.TrafficEnv`.
 
     Raises:
-        ValueError: a number that is not positive, an episode longer than a log, or a control that is none.
+        ValueError: a number that is not positive.
     """
 
     max_pieces: int = 512
     piece_length: float = 12.0
-    max_controlled: int = MAX_CONTROLLED
-    decision_steps: int = 5
-    horizon: int = 16
-    control: Control = "all"
-    arrivals: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("max_pieces", "piece_length", "max_controlled", "decision_steps", "horizon"):
+        for name in ("max_pieces", "piece_length"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
-        check_control(self.control)
-        check_episode(self.decision_steps, self.horizon)
 
 
 class SceneContext(TensorClass["nocast"]):
-    """Inputs of the policy for one scene, or for a padded batch of them (``*`` is nothing or ``S``).
+    """Inputs of MotionLM for one scene, or for a padded batch of them (``*`` is nothing or ``S``).
 
     Attributes:
+        episode: its agents.
         map_pose: ``[*, P, 3]`` middle of a piece, heading along it.
         map_points: ``[*, P, PIECE_POINTS, 2]`` in the frame of the piece [m].
         map_kind: ``[*, P]`` :class:`~envs.scene.MapKind`.
@@ -74,18 +61,10 @@ class SceneContext(TensorClass["nocast"]):
         light_pose: ``[*, G, 3]`` stop point, heading of the lane.
         light_state: ``[*, G, HISTORY]`` :class:`~envs.scene.LightState` plus one.
         light_valid: ``[*, G]`` bool.
-        history: ``[*, A, HISTORY, 3]`` logged poses in the agent's current frame; 0 where invalid.
-        history_valid: ``[*, A, HISTORY]`` bool.
-        extent: ``[*, A, 3]`` [m].
-        kind: ``[*, A]`` :class:`~envs.scene.AgentKind`.
-        recent: ``[*, A, F + 1, 3]`` poses of the last decision before the episode.
-        valid: ``[*, A]`` bool, the agent is there at the current step; false for padding and arrivals.
-        controlled: ``[*, A]`` bool.
-        logged: ``[*, A, T * F, 3]`` logged poses to come; where invalid, what
-            :func:`~envs.participants.simulated_agents` holds there: read it under its mask.
-        logged_valid: ``[*, A, T * F]`` bool.
     """
 
+    of_agents: ClassVar[tuple[str, ...]] = ()
+    episode: Episode
     map_pose: Tensor
     map_points: Tensor
     map_kind: Tensor
@@ -94,83 +73,38 @@ class SceneContext(TensorClass["nocast"]):
     light_pose: Tensor
     light_state: Tensor
     light_valid: Tensor
-    history: Tensor
-    history_valid: Tensor
-    extent: Tensor
-    kind: Tensor
-    recent: Tensor
-    valid: Tensor
-    controlled: Tensor
-    logged: Tensor
-    logged_valid: Tensor
 
 
-AGENT_FIELDS = ("history", "history_valid", "extent", "kind", "recent", "valid", "controlled", "logged", "logged_valid")
-"""Fields of a :class:`SceneContext` that have one row for each agent."""
-
-
-def make_context(scene: Scene, options: ContextOptions | None = None) -> SceneContext:
-    """Cut up one uncollated scene; its agents are those of a simulation: the present ones, then arrivals.
+def featurize(scene: Scene, episode: Episode, options: ContextOptions | None = None) -> SceneContext:
+    """Cut up one uncollated scene.
 
     Examples:
+        >>> from envs.episode import make_episode
         >>> from envs.sources.synthetic import straight_road
-        >>> make_context(straight_road(2)).history.shape
-        torch.Size([2, 11, 3])
+        >>> scene = straight_road(2)
+        >>> featurize(scene, make_episode(scene)).map_points.shape[1:]
+        torch.Size([5, 2])
     """
     options = options or ContextOptions()
-    steps = options.decision_steps * options.horizon
-    scene = simulated_agents(scene, arrivals=options.arrivals, last_step=CURRENT_STEP + steps)
-    agents = scene.agents
-    poses, current = agents.poses, agents.poses[:, CURRENT_STEP]
-    valid_history = agents.valid[:, :HISTORY]
-    future = slice(HISTORY, HISTORY + steps)
-    pieces = _map_pieces(scene.road, scene.lights, _reach(agents, options), options)
-    map_pose, map_points, map_kind, map_light = pieces
-    light_pose = _light_poses(scene.road, scene.lights)
+    places = _reach(scene.agents, episode.logged.shape[-2])
+    map_pose, map_points, map_kind, map_light = _map_pieces(scene.road, scene.lights, places, options)
     return SceneContext(
+        episode=episode,
         map_pose=map_pose,
         map_points=map_points,
         map_kind=map_kind,
         map_light=map_light,
         map_valid=torch.ones(len(map_kind), dtype=torch.bool),
-        light_pose=light_pose,
+        light_pose=_light_poses(scene.road, scene.lights),
         light_state=scene.lights.state[:, :HISTORY] + 1,
         light_valid=scene.lights.state[:, CURRENT_STEP] != LightState.ABSENT,
-        history=to_local(poses[:, :HISTORY], current[:, None]) * valid_history[..., None],
-        history_valid=valid_history,
-        extent=agents.extent,
-        kind=agents.kind,
-        recent=agents.recent(options.decision_steps),
-        valid=agents.present,
-        controlled=choose_controlled(scene, options.max_controlled, options.control),
-        logged=poses[:, future],
-        logged_valid=agents.valid[:, future],
         batch_size=[],
     )
 
 
-def collate_contexts(contexts: Sequence[SceneContext]) -> SceneContext:
-    """Pad contexts to a batch of batch size ``[S]``; padding is 0 and invalid."""
-    return SceneContext(
-        **{
-            field.name: pad_sequence([getattr(context, field.name) for context in contexts], batch_first=True)
-            for field in fields(SceneContext)
-        },
-        batch_size=[len(contexts)],
-    )
-
-
-def keep_agents(context: SceneContext, index: Tensor) -> SceneContext:
-    """Keep some agents of one uncollated context."""
-    context = context.clone(recurse=False)
-    for name in AGENT_FIELDS:
-        setattr(context, name, getattr(context, name)[index])
-    return context
-
-
-def _reach(agents: Agents, options: ContextOptions) -> Tensor:
+def _reach(agents: Agents, steps: int) -> Tensor:
     """``[n, 2]``: where present agents are, and would be each second of the episode at constant velocity."""
-    seconds = torch.arange(0.0, options.decision_steps * options.horizon * STEP_SECONDS + 0.5)
+    seconds = torch.arange(0.0, steps * STEP_SECONDS + 0.5)
     ahead = agents.velocity[agents.present, CURRENT_STEP, None] * seconds[:, None]
     places = (agents.position[agents.present, CURRENT_STEP, None, :2] + ahead).flatten(0, 1)
     return torch.unique((places / REACH_GRID).round(), dim=0) * REACH_GRID  # the standing ones count once

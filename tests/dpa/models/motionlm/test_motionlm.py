@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 import torch
 from torch import Tensor
 
-from dpa.policy import SIZES, ContextOptions, MotionLM, SceneContext, collate_contexts, make_context
-from dpa.policy.context import keep_agents
+from dpa.models import collate_contexts, make_context
+from dpa.models.context import keep_agents
+from dpa.models.motionlm import SIZES, ContextOptions, MotionLM, SceneContext, featurize
 from dpa.tokens import VerletTokenizer
+from envs.episode import EpisodeOptions
 from envs.scene import Scene
 from envs.sources.synthetic import straight_road
 
@@ -42,14 +45,14 @@ def test_logits_do_not_change_when_the_scene_is_moved_and_turned(
     model: MotionLM, scene: Callable[..., Scene], move: Callable[[Scene, Tensor], Scene]
 ) -> None:
     tokens = draw(3)
-    here = logits_of(model, make_context(scene()), tokens)
+    here = logits_of(model, make_context(scene(), featurize), tokens)
     for motion in ((150.0, -80.0, 0.0), (0.0, 0.0, 1.7), (-60.0, 90.0, -2.9)):
-        there = logits_of(model, make_context(move(scene(), torch.tensor(motion))), tokens)
+        there = logits_of(model, make_context(move(scene(), torch.tensor(motion)), featurize), tokens)
         torch.testing.assert_close(there.softmax(-1), here.softmax(-1), **CLOSE)
 
 
 def test_logits_follow_the_order_of_the_agents(model: MotionLM, scene: Callable[..., Scene]) -> None:
-    context, tokens, order = make_context(scene(4)), draw(4), torch.tensor([2, 0, 3, 1])
+    context, tokens, order = make_context(scene(4), featurize), draw(4), torch.tensor([2, 0, 3, 1])
     logits = logits_of(model, context, tokens)
     shuffled = logits_of(model, keep_agents(context, order), tokens[:, :, order])
     torch.testing.assert_close(shuffled, logits[:, :, order], **CLOSE)
@@ -57,7 +60,7 @@ def test_logits_follow_the_order_of_the_agents(model: MotionLM, scene: Callable[
 
 @pytest.mark.parametrize("decision", [0, 1, 7, 15])
 def test_a_token_changes_no_decision_up_to_its_own(model: MotionLM, scene: Callable[..., Scene], decision: int) -> None:
-    context, tokens = make_context(scene(4)), draw(4)
+    context, tokens = make_context(scene(4), featurize), draw(4)
     other = tokens.clone()
     other[:, :, 1, decision:] = draw(4, seed=1)[:, :, 1, decision:]
     other[:, :, 1, decision] = 13 * 12
@@ -69,7 +72,7 @@ def test_a_token_changes_no_decision_up_to_its_own(model: MotionLM, scene: Calla
 
 def test_agents_do_not_see_what_others_choose_at_the_same_time(model: MotionLM, scene: Callable[..., Scene]) -> None:
     """eq. 1: the joint distribution of a decision is a product over agents."""
-    context, tokens = make_context(scene(3)), draw(3)
+    context, tokens = make_context(scene(3), featurize), draw(3)
     other = tokens.clone()
     other[..., 0, 3] = 13 * 12
     left, right = logits_of(model, context, tokens), logits_of(model, context, other)
@@ -77,7 +80,10 @@ def test_agents_do_not_see_what_others_choose_at_the_same_time(model: MotionLM, 
 
 
 def test_padding_changes_nothing(model: MotionLM, scene: Callable[..., Scene]) -> None:
-    small, large = make_context(scene(2)), make_context(scene(6, seed=1), ContextOptions(max_pieces=1000))
+    small, large = (
+        make_context(scene(2), featurize),
+        make_context(scene(6, seed=1), partial(featurize, options=ContextOptions(max_pieces=1000))),
+    )
     tokens = draw(6)
     alone = logits_of(model, small, tokens[:, :, :2])
     valid = torch.ones(2, 1, 6, 16, dtype=torch.bool)
@@ -87,16 +93,16 @@ def test_padding_changes_nothing(model: MotionLM, scene: Callable[..., Scene]) -
 
 
 def test_agents_that_are_not_valid_change_nothing(model: MotionLM, scene: Callable[..., Scene]) -> None:
-    context, tokens = make_context(scene(4)), draw(4)
+    context, tokens = make_context(scene(4), featurize), draw(4)
     alone = logits_of(model, keep_agents(context, torch.arange(3)), tokens[:, :, :3])
     context = context.clone()
-    context.valid[3] = context.controlled[3] = context.logged_valid[3] = False
-    context.recent[3], context.history[3] = 1e3, 7.0
+    context.episode.valid[3] = context.episode.controlled[3] = context.episode.logged_valid[3] = False
+    context.episode.recent[3], context.episode.history[3] = 1e3, 7.0
     torch.testing.assert_close(logits_of(model, context, tokens)[:, :, :3], alone, **CLOSE)
 
 
 def test_an_agent_is_seen_until_its_tokens_end(model: MotionLM, scene: Callable[..., Scene]) -> None:
-    context, tokens = make_context(scene(3, leave=False)), draw(3)
+    context, tokens = make_context(scene(3, leave=False), featurize), draw(3)
     valid = all_valid(tokens)
     valid[..., 2, 5:] = False
     other = tokens.clone()
@@ -110,20 +116,20 @@ def test_an_agent_is_seen_until_its_tokens_end(model: MotionLM, scene: Callable[
 
 
 def test_agents_that_follow_the_log_are_seen_where_the_log_is(model: MotionLM, scene: Callable[..., Scene]) -> None:
-    context, tokens = make_context(scene(3, leave=False), ContextOptions(max_controlled=2)), draw(3)
-    replayed = int((~context.controlled).nonzero()[0])
+    context, tokens = make_context(scene(3, leave=False), featurize, EpisodeOptions(max_controlled=2)), draw(3)
+    replayed = int((~context.episode.controlled).nonzero()[0])
     other = tokens.clone()
     other[:, :, replayed] = draw(3, seed=2)[:, :, replayed]
     left = logits_of(model, context, tokens)
     assert torch.equal(left, logits_of(model, context, other)), "their tokens mean nothing"
     late = context.clone()
-    late.logged[replayed, 40:, :2] += 3.0
+    late.episode.logged[replayed, 40:, :2] += 3.0
     changed = (left != logits_of(model, late, tokens)).any(-1)
-    assert not changed[..., :9].any() and changed[..., context.controlled, 9].all()
+    assert not changed[..., :9].any() and changed[..., context.episode.controlled, 9].all()
 
 
 def test_rollouts_of_a_scene_do_not_see_each_other(model: MotionLM, scene: Callable[..., Scene]) -> None:
-    context, tokens = make_context(scene(3)), draw(3, rollouts=4)
+    context, tokens = make_context(scene(3), featurize), draw(3, rollouts=4)
     together = logits_of(model, context, tokens)
     for rollout in range(4):
         torch.testing.assert_close(
@@ -136,8 +142,8 @@ def test_a_shorter_episode_is_the_beginning_of_a_longer_one(
     model: MotionLM, scene: Callable[..., Scene], horizon: int
 ) -> None:
     tokens = draw(3)
-    logits = logits_of(model, make_context(scene()), tokens)
-    short = logits_of(model, make_context(scene(), ContextOptions(horizon=horizon)), tokens[..., :horizon])
+    logits = logits_of(model, make_context(scene(), featurize), tokens)
+    short = logits_of(model, make_context(scene(), featurize, EpisodeOptions(horizon=horizon)), tokens[..., :horizon])
     torch.testing.assert_close(short, logits[..., :horizon, :], **CLOSE)
 
 
@@ -146,7 +152,7 @@ def test_fewer_tokens_than_the_context_has_decisions_see_the_log_at_the_same_tim
 ) -> None:
     road = scene()
     road.agents.valid[1, 25:] = False
-    context = make_context(road, ContextOptions(max_controlled=1))
+    context = make_context(road, featurize, EpisodeOptions(max_controlled=1))
     tokens = draw(3)
     whole, part = logits_of(model, context, tokens), logits_of(model, context, tokens[..., :8])
     torch.testing.assert_close(part, whole[..., :8, :], **CLOSE)
@@ -154,7 +160,7 @@ def test_fewer_tokens_than_the_context_has_decisions_see_the_log_at_the_same_tim
 
 def test_everything_that_trains_gets_a_gradient(model: MotionLM, scene: Callable[..., Scene]) -> None:
     with torch.enable_grad():
-        logits_of(model, make_context(scene()), draw(3)).log_softmax(-1)[..., 0].sum().backward()
+        logits_of(model, make_context(scene(), featurize), draw(3)).log_softmax(-1)[..., 0].sum().backward()
     without = [name for name, p in model.named_parameters() if p.grad is None or not p.grad.isfinite().all()]
     assert not without
 
@@ -178,7 +184,7 @@ def test_an_unknown_size_is_refused() -> None:
 
 
 def test_a_scene_without_lights_and_with_one_agent_works(model: MotionLM) -> None:
-    assert logits_of(model, make_context(straight_road(1)), draw(1)).isfinite().all()
+    assert logits_of(model, make_context(straight_road(1), featurize), draw(1)).isfinite().all()
 
 
 if __name__ == "__main__":

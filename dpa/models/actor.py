@@ -1,4 +1,4 @@
-"""MotionLM as a TorchRL policy: samples one token per agent, incrementally."""
+"""A policy of any family as a TorchRL policy: samples one token per agent, incrementally."""
 
 from __future__ import annotations
 
@@ -10,62 +10,18 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from dpa.policy.context import AGENT_FIELDS, ContextOptions, SceneContext, collate_contexts, make_context
-from dpa.policy.decoder import NodeCache, NodeInputs, SceneMemory
-from dpa.policy.motionlm import MotionLM
-from dpa.policy.precision import Precision, check_precision, running_in
-from dpa.policy.sampling import Decoding, draw, rollout_noise
+from dpa.models.base import MotionModel, Observation
+from dpa.models.context import Context, Contexts, collate_contexts, pad_context
+from dpa.models.precision import Precision, check_precision, running_in
+from dpa.models.sampling import Decoding, draw, rollout_noise
 from envs import keys
-from envs.scene import SceneSource
-
-
-class Contexts:
-    """Contexts of the scenes of a source, made on first use; the latest are kept.
-
-    Args:
-        scenes: where scenes come from.
-        options: how they are cut up.
-        most: contexts that are kept, of about 100 KB each.
-
-    Examples:
-        >>> from envs.sources.synthetic import straight_road
-        >>> contexts = Contexts([straight_road(2)])
-        >>> len(contexts), contexts.scene_id(0)
-        (1, 'straight_road_2_None')
-    """
-
-    def __init__(self, scenes: SceneSource, options: ContextOptions | None = None, most: int = 4096) -> None:
-        self.scenes = scenes
-        self.options = options or ContextOptions()
-        self.most = most
-        self._made: dict[int, tuple[SceneContext, str]] = {}
-
-    def __len__(self) -> int:
-        return len(self.scenes)
-
-    def __getitem__(self, index: int) -> SceneContext:
-        return self._entry(index)[0]
-
-    def scene_id(self, index: int) -> str:
-        """The id of a scene."""
-        return self._entry(index)[1]
-
-    def _entry(self, index: int) -> tuple[SceneContext, str]:
-        entry = self._made.pop(index, None)
-        if entry is None:
-            scene = self.scenes[index]
-            entry = make_context(scene, self.options), scene.scene_id
-        if len(self._made) >= self.most:
-            del self._made[next(iter(self._made))]  # the one whose last use is longest ago
-        self._made[index] = entry
-        return entry
 
 
 class MotionActor(TensorDictModuleBase):
     """Samples tokens for the rows of a :class:`~envs.traffic.TrafficEnv` with :class:`~dpa.tokens.TokenAction`.
 
-    A scene is encoded once, when an episode of it starts, and shared by its K rows; keys and values of the decisions
-    taken are kept between calls. Rows may stand at different decisions.
+    What a policy sees of a scene is made once, when an episode of it starts, and shared by its K rows; the policy's
+    memory keeps the decisions taken between calls. Rows may stand at different decisions.
 
     A rollout is decided by the scene's id, its number k among the scene's rollouts and the seed: not by the batch that
     it is part of, up to the rounding of the logits (about 1e-6), which can turn a draw that falls between two tokens.
@@ -83,7 +39,7 @@ class MotionActor(TensorDictModuleBase):
         first_rollout: number of the first of the K rollouts, where others roll out the ones before.
         precision: ``"bfloat16"`` runs linear layers in bfloat16 (autocast), for GPUs; attention, which holds places
             relative to each other as differences of large numbers, stays in float32. ``"float32"`` is exact.
-        compile: run the decoder through :func:`torch.compile`: slow at first, for half a minute, then faster. It needs
+        compile: run what decodes through :func:`torch.compile`: slow at first, for half a minute, then faster. It needs
             a C++ compiler. Values agree to float32's rounding.
 
     Raises:
@@ -94,19 +50,20 @@ class MotionActor(TensorDictModuleBase):
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
+        >>> from dpa.models.motionlm import MotionLM
         >>> from dpa.tokens import TokenAction, VerletTokenizer
         >>> from envs.sources.synthetic import straight_road
         >>> from envs.traffic import TrafficEnv
-        >>> scenes, tokenizer = [straight_road(2)], VerletTokenizer()
-        >>> env = TransformedEnv(TrafficEnv(scenes, num_rollouts=4), TokenAction(tokenizer))
-        >>> actor = MotionActor(MotionLM("nano", tokenizer), Contexts(scenes), num_rollouts=4)
+        >>> scenes, model = [straight_road(2)], MotionLM("nano", VerletTokenizer())
+        >>> env = TransformedEnv(TrafficEnv(scenes, num_rollouts=4), TokenAction(model.tokenizer))
+        >>> actor = MotionActor(model, Contexts(scenes, model.featurize), num_rollouts=4)
         >>> env.rollout(16, actor)["agents", "token"].shape
         torch.Size([4, 16, 2])
     """
 
     def __init__(
         self,
-        model: MotionLM,
+        model: MotionModel,
         contexts: Contexts,
         *,
         num_rollouts: int = 1,
@@ -122,11 +79,9 @@ class MotionActor(TensorDictModuleBase):
         self.model, self.contexts = model, contexts
         self.num_rollouts, self.first_rollout = num_rollouts, first_rollout
         self.decoding, self.precision = decoding or Decoding(top_p=1.0), check_precision(precision)
-        # Of the method, so that the wrapper of a module is not registered beside the module.
-        self._decode = torch.compile(model.decoder.forward) if compile else model.decoder.forward
-        self._memory: SceneMemory | None = None
+        self._memory = model.remember(compile=compile)
         self._due: Tensor | None = None  # [B], the decision that each row takes next
-        self._cache: NodeCache | None = None
+        self._last: Tensor | None = None  # [B, A], tokens of the decision before
         self.set_seed(seed)
 
     @torch.no_grad()
@@ -141,17 +96,14 @@ class MotionActor(TensorDictModuleBase):
         return tensordict
 
     def logits(self, tensordict: TensorDictBase) -> Tensor:
-        """``[B, A, V]`` of the decision at hand; adds its nodes to the cache."""
+        """``[B, A, V]`` of the decision at hand, which the memory keeps."""
         recent, step = tensordict[keys.RECENT], tensordict[keys.STEP][:, 0]
         self._start(tensordict)
         self._due = step + 1
         controlled = tensordict[keys.CONTROLLED]
         last = torch.where((step[:, None] > 0) & controlled, self._last, self.model.no_token)
-        valid = tensordict[keys.VALID]
-        masks = self._cache.start(step, valid)
-        nodes = NodeInputs(recent, last, step[:, None].expand_as(last), tensordict[keys.KIND], valid)
         with running_in(self.precision, recent.device):
-            return self._decode(nodes, self._memory, masks, self._cache)
+            return self._memory.step(Observation(recent, last, step, tensordict[keys.KIND], tensordict[keys.VALID]))
 
     def set_seed(self, seed: int) -> None:
         """Seed the sampling anew: the rollouts that begin from now on are the first ones of this seed."""
@@ -160,7 +112,7 @@ class MotionActor(TensorDictModuleBase):
 
     # --- the start of episodes --------------------------------------------------------------------------------------
     def _start(self, tensordict: TensorDictBase) -> None:
-        """Encode the scenes of which an episode starts, and draw the numbers that decide the rollouts that do."""
+        """Look at the scenes of which an episode starts, and draw the numbers that decide the rollouts that do."""
         step, shape = tensordict[keys.STEP][:, 0], tensordict[keys.VALID].shape
         if shape[0] % self.num_rollouts:
             raise ValueError(f"num_rollouts must divide the batch of {shape[0]} rows, got {self.num_rollouts}.")
@@ -170,8 +122,10 @@ class MotionActor(TensorDictModuleBase):
             self._count(scene, step)
         if not begins.any():
             return
-        if self._cache is None or self._last.shape != shape or begins.all():
-            self._allocate(shape, step.device)
+        anew = self._last is None or self._last.shape != shape or bool(begins.all())
+        if anew:
+            self._last = torch.full(shape, self.model.no_token, device=step.device)
+            self._noise = torch.zeros(shape[0], self.model.config.horizon, shape[1])
             begins = torch.ones_like(begins)
             self._scenes = scene.view(-1, self.num_rollouts)[:, 0].clone()
         fresh = begins.view(-1, self.num_rollouts).any(-1)
@@ -182,7 +136,7 @@ class MotionActor(TensorDictModuleBase):
         self._check_agents(context, tensordict, step == 0)
         self._context = context
         with running_in(self.precision, step.device):
-            self._memory = self.model.encode(context)
+            self._memory.begin(context, self.num_rollouts, anew)
         self._draw_noise(begins.nonzero()[:, 0].tolist(), scene.tolist())
 
     def _check_order(self, step: Tensor) -> None:
@@ -193,27 +147,16 @@ class MotionActor(TensorDictModuleBase):
                 "0 was due; reset the environment, and give each environment an actor of its own."
             )
 
-    def _check_agents(self, context: SceneContext, tensordict: TensorDictBase, begins: Tensor) -> None:
+    def _check_agents(self, context: Context, tensordict: TensorDictBase, begins: Tensor) -> None:
         """Refuse contexts of other agents than the environment's."""
         group = begins.nonzero()[:, 0] // self.num_rollouts
         for name, key in (("kind", keys.KIND), ("valid", keys.VALID), ("recent", keys.RECENT)):
-            mine, theirs = getattr(context, name)[group], tensordict[key][begins]
+            mine, theirs = getattr(context.episode, name)[group], tensordict[key][begins]
             if not torch.allclose(mine.float(), theirs.float(), atol=1e-3):
                 raise ValueError(
                     f"the contexts of the policy and the environment differ in {name!r} of the agents of a scene; give "
                     "both the same scenes, arrivals, decision_steps and horizon."
                 )
-
-    def _allocate(self, shape: torch.Size, device: torch.device) -> None:
-        """Buffers for B rows of A agents; those of the episodes before serve again."""
-        config = self.model.config
-        size = (shape[0], config.heads, config.horizon, shape[1])
-        if self._cache is None or self._cache.shape != size:
-            like = self.model.decoder.head.weight
-            self._cache = NodeCache(config.decoder_layers, size, config.width // config.heads, like)
-        self._cache.clear()
-        self._last = torch.full(shape, self.model.no_token, device=device)
-        self._noise = torch.zeros(shape[0], config.horizon, shape[1])
 
     def _count(self, scene: Tensor, step: Tensor) -> None:
         """An episode has begun when it takes its second decision: a collector may try a policy out on the first one."""
@@ -228,7 +171,7 @@ class MotionActor(TensorDictModuleBase):
             named = (scene[row], rollout)
             episode = self._begun.get(named, 0) + beside[named]
             beside[named] += 1  # groups of one batch may show the same scene
-            agents = len(self.contexts[scene[row]].kind)
+            agents = len(self.contexts[scene[row]].episode.kind)
             scene_id = self.contexts.scene_id(scene[row])
             self._noise[row, :, :agents] = rollout_noise(self.seed, scene_id, rollout, episode, (horizon, agents))
         self._noise_there = self._noise.to(self._last.device, non_blocking=True)
@@ -243,19 +186,3 @@ class MotionActor(TensorDictModuleBase):
         uniform = self._noise_there[torch.arange(len(step), device=step.device), step]
         token = draw(log_probs, uniform)
         return token, log_probs.gather(-1, token[..., None])[..., 0]
-
-
-def pad_context(context: SceneContext, agents: int) -> SceneContext:
-    """Pad the agents of a batch of contexts to ``agents``.
-
-    Raises:
-        ValueError: the contexts hold more agents.
-    """
-    missing = agents - context.kind.shape[1]
-    if missing < 0:
-        raise ValueError(f"the contexts hold {context.kind.shape[1]} agents and the environment {agents}.")
-    context = context.clone(recurse=False)
-    for name in AGENT_FIELDS:
-        value = getattr(context, name)
-        setattr(context, name, torch.cat((value, value.new_zeros(len(value), missing, *value.shape[2:])), 1))
-    return context

@@ -1,0 +1,17 @@
+"""Policies: the contract of a family, the families, and their use as TorchRL policies."""
+
+from dpa.models.actor import MotionActor
+from dpa.models.base import Memory, MotionModel, Observation
+from dpa.models.context import Contexts, collate_contexts, make_context
+from dpa.models.sampling import Decoding
+
+__all__ = [
+    "Contexts",
+    "Decoding",
+    "Memory",
+    "MotionActor",
+    "MotionModel",
+    "Observation",
+    "collate_contexts",
+    "make_context",
+]

@@ -1,0 +1,94 @@
+"""The contract of a policy family: all that actor, losses, collectors and recipes ask of a policy."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, NamedTuple, Protocol
+
+from torch import Tensor, nn
+
+from dpa.models.context import Context, Featurize
+from dpa.tokens.base import MotionTokenizer
+
+
+class Observation(NamedTuple):
+    """What B rollouts of A agents show of themselves at a decision; rows may stand at different ones.
+
+    Attributes:
+        recent: ``[B, A, F + 1, 3]`` poses of the last decision.
+        token: ``[B, A]`` token of it; V where there is none.
+        step: ``[B]`` index of the decision.
+        kind: ``[B, A]`` :class:`~envs.scene.AgentKind`.
+        valid: ``[B, A]`` bool, the agent is there.
+    """
+
+    recent: Tensor
+    token: Tensor
+    step: Tensor
+    kind: Tensor
+    valid: Tensor
+
+
+class Memory(Protocol):
+    """Running rollouts of some scenes: what a policy keeps of them between two decisions."""
+
+    def begin(self, context: Context, rollouts: int, anew: bool) -> None:
+        """Rollouts begin, of these scenes from now on.
+
+        Args:
+            context: of batch size ``[S]``.
+            rollouts: K, contiguous rows of each scene.
+            anew: all rollouts do; otherwise some go on where they are, of scenes that are what they were.
+        """
+
+    def step(self, seen: Observation) -> Tensor:
+        """``[B, A, V]`` logits of the decision at hand; equal to those of teacher forcing up to rounding (1e-5)."""
+
+
+class MotionModel(nn.Module, ABC):
+    """The distribution of what all agents of a scene do, decision after decision.
+
+    A subclass is a family: one folder, and one line in :data:`~dpa.models.registry.FAMILIES`.
+
+    Attributes:
+        tokenizer: what an action is.
+        config: size of the model, a dataclass with ``horizon``.
+    """
+
+    tokenizer: MotionTokenizer
+    config: Any
+
+    @property
+    def no_token(self) -> int:
+        """Stands for the last token of an agent that has none: V."""
+        return self.tokenizer.vocab_size
+
+    @property
+    @abstractmethod
+    def featurize(self) -> Featurize:
+        """Makes what the policy sees of a scene, with padding and cropping of its own; it holds no weights."""
+
+    @abstractmethod
+    def forward(self, context: Context, tokens: Tensor, token_valid: Tensor) -> Tensor:
+        """Teacher-forced logits of every token of M rollouts of each scene.
+
+        Args:
+            context: of batch size ``[S]``.
+            tokens: ``[S, M, A, T]`` int64.
+            token_valid: ``[S, M or 1, A, T]`` bool; a controlled agent is seen by others while its tokens are valid.
+
+        Returns:
+            ``[S, M, A, T, V]`` logits; those of agents that are not controlled mean nothing.
+        """
+
+    @abstractmethod
+    def remember(self, *, compile: bool = False) -> Memory:
+        """A memory of running rollouts.
+
+        Args:
+            compile: run what decodes through :func:`torch.compile`.
+        """
+
+    @abstractmethod
+    def bytes_per_row(self) -> int:
+        """Memory of one agent of one rollout while it runs: what is kept of it, and what a decision computes."""
