@@ -11,10 +11,12 @@ from torch import Tensor
 
 from envs.geometry.frames import to_local
 from envs.participants import MAX_CONTROLLED, Control, check_control, choose_controlled, simulated_agents
-from envs.scene import CURRENT_STEP, Scene, check_episode
+from envs.scene import CURRENT_STEP, LOG_STEPS, Scene, check_episode
 
 HISTORY = CURRENT_STEP + 1
 """Logged steps up to the current one."""
+EPISODE_STEPS = LOG_STEPS - HISTORY
+"""Logged steps of 0.1 s after the current one: 8 s."""
 
 
 @dataclass(frozen=True)

@@ -40,10 +40,10 @@ from envs.scene import SceneSource
 from envs.seeding import make_generator
 from recipes.common.cli import CONFIG, build, check_steps, deciding, finished, ranked_recipe
 from recipes.common.models import (
-    build_policy,
     check_written,
     digest_of,
     episode_options,
+    fresh_policy,
     policy_config,
     policy_file,
     write_policy,
@@ -97,7 +97,7 @@ def pretrain(
         return path
     seed_everything(seed)
     device = ranks.place(cfg.device)
-    model = build_policy(config).to(device)
+    model = fresh_policy(cfg.model).to(device)
     if origin is not None:
         origin.load_into(model, config)
     best = copy.deepcopy(model)

@@ -1,10 +1,15 @@
 """Measure what tokenization loses: the logs of scenes, tokenized and decoded again, against the logs.
 
 python -m recipes.tokens scenes=gpudrive scenes.train=DIR scenes.eval=DIR json=runs/tokens.json
-python -m recipes.tokens model.tokenizer.interpolation=linear
+python -m recipes.tokens tokenizer@model.tokenizer=verlet_fine
+
+Besides the errors of poses it tells the realism of the log and of the log through tokens, every rollout alike: what
+tokens leave of the metric to any policy that uses them.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import hydra
 import torch
@@ -12,19 +17,24 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
+from dpa.realism import RealismConfig, realism
 from dpa.tokens import MotionTokenizer
 from envs.episode import EpisodeOptions, make_episode
 from envs.files import write_json
 from envs.geometry.frames import wrap_angle
 from envs.progress import progress
 from envs.scene import STEP_SECONDS, AgentKind, SceneSource
-from recipes.common.cli import CONFIG, plain, recipe
-from recipes.common.models import build_policy, episode_options, policy_config
+from recipes.common.cli import CONFIG, recipe
+from recipes.common.models import episode_options, fresh_policy, policy_config
 from recipes.common.scenes import open_splits
+from recipes.studies.rungs import logged, tokenized_log
 
 CLASSES = (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST)
 MOVING = 1.0
 """An agent that its log moves further than this in the episode [m]."""
+BUCKETS = ("realism", "kinematic", "interactive", "map_based")
+ROLLOUTS = 32
+"""All alike."""
 
 
 def reconstruction_errors(
@@ -77,18 +87,48 @@ def _statistics(values: torch.Tensor) -> dict[str, float]:
     }
 
 
+def realism_left(scenes: SceneSource, tokenizer: MotionTokenizer, metric: RealismConfig) -> dict[str, list[Any]]:
+    """Realism and its buckets, scene by scene, of the log and of the log through tokens.
+
+    Returns:
+        ``log`` and ``tokens``, each the results of the scenes in order.
+    """
+    rungs, generator = {"log": logged, "tokens": tokenized_log(tokenizer)}, torch.Generator()
+    found: dict[str, list[Any]] = {name: [] for name in rungs}
+    for index in progress(range(len(scenes)), "realism", unit="scene"):
+        scene = scenes[index]
+        for name, rung in rungs.items():
+            found[name].append(realism(scene, rung(scene, ROLLOUTS, generator), metric).as_dict())
+    return found
+
+
+def realism_table(found: dict[str, list[Any]]) -> dict[str, dict[str, float]]:
+    """Means over the scenes that have realism."""
+    known = [place for place, result in enumerate(found["log"]) if result["realism"] == result["realism"]]
+    return {
+        name: {key: sum(results[place][key] for place in known) / max(1, len(known)) for key in BUCKETS}
+        for name, results in found.items()
+    }
+
+
 @hydra.main(**CONFIG, config_name="tokens")
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.tokens``."""
-    model, scenes = build_policy(policy_config(cfg.model)), open_splits(cfg.scenes)[cfg.split]
+    model, scenes = fresh_policy(cfg.model), open_splits(cfg.scenes)[cfg.split]
     errors = reconstruction_errors(scenes, model.tokenizer, episode_options(cfg.model))
     table = Table("agents", "poses", "position mean [m]", "p99 [m]", "heading mean [deg]", "speed mean [m/s]")
     for name, row in errors.items():
         table.add_row(name, *(f"{value:.3f}" if isinstance(value, float) else str(value) for value in row.values()))
     Console(markup=False).print(table)
+    left = realism_table(realism_left(scenes, model.tokenizer, RealismConfig.load(str(cfg.metric))))
+    realistic = Table("", *BUCKETS, title=f"realism, {len(scenes)} scenes, {model.tokenizer.vocab_size} tokens")
+    for name, row in left.items():
+        realistic.add_row("log through tokens" if name == "tokens" else name, *(f"{row[key]:.3f}" for key in BUCKETS))
+    Console(markup=False).print(realistic)
     if cfg.json is not None:
-        write_json(cfg.json, {"tokenizer": plain(cfg.model.tokenizer), "scenes": len(scenes), "errors": errors})
+        config = policy_config(cfg.model)["tokenizer"]
+        write_json(cfg.json, {"tokenizer": config, "scenes": len(scenes), "errors": errors, "realism": left})
 
 
 if __name__ == "__main__":

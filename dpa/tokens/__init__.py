@@ -1,7 +1,8 @@
 """Motion tokens: a decision of 0.5 s as one word of a small vocabulary."""
 
 from dpa.tokens.base import MotionTokenizer, TokenizedTracks
+from dpa.tokens.disks import KDisksTokenizer
 from dpa.tokens.transform import TokenAction
 from dpa.tokens.verlet import VerletTokenizer
 
-__all__ = ["MotionTokenizer", "TokenAction", "TokenizedTracks", "VerletTokenizer"]
+__all__ = ["KDisksTokenizer", "MotionTokenizer", "TokenAction", "TokenizedTracks", "VerletTokenizer"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from abc import abstractmethod
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -43,6 +43,14 @@ class MotionTokenizer(nn.Module):
 
     vocab_size: int
     steps: int
+
+    @classmethod
+    def settled(cls, **options: Any) -> dict[str, Any]:
+        """Options as a checkpoint holds them: those that do not depend on a file of the machine."""
+        return options
+
+    def fill(self, **options: Any) -> None:
+        """Take over what options name that :meth:`settled` leaves out; a policy from a file has it in its weights."""
 
     @abstractmethod
     def encode(self, target: Tensor, recent: Tensor, kind: Tensor) -> Tensor:

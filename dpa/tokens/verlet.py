@@ -14,7 +14,7 @@ from envs.scene import STEP_SECONDS, AgentKind
 
 CHANGES = 13
 """Changes per coordinate: up to six bins each way (Seff et al. 2023, section 3.2)."""
-MAX_BIN = 64
+REACH = 64
 """Largest displacement in bins: 128 bins of 0.28125 m cover [-18, 18] m."""
 Interpolation = Literal["linear", "quadratic"]
 Frame = Literal["current", "scene"]
@@ -39,23 +39,25 @@ def _by_kind(name: str, values: Mapping[str, object], width: int) -> Tensor:
 
 
 class VerletTokenizer(MotionTokenizer):
-    """13 x 13 changes of the displacement per decision (MotionLM, method.md section 2).
+    """C x C changes of the displacement per decision, 13 x 13 in MotionLM (method.md section 2).
 
     A displacement is a whole number of bins along and across the agent's heading. The displacement of the last
-    decision is read from ``recent``, turned into the current frame and rounded to bins; the token ``13 * i + j`` then
-    changes it by ``i - 6`` bins forward and ``j - 6`` bins to the left. Token 84 keeps the velocity.
+    decision is read from ``recent``, turned into the current frame and rounded to bins. Of 13 x 13 tokens,
+    ``13 * i + j`` changes it by ``i - 6`` bins forward and ``j - 6`` bins to the left; 84 keeps the velocity.
 
     Args:
         steps: F, poses of 0.1 s in one token.
 
     Keyword Args:
         bins: forward and lateral bin of each class [m per decision].
+        changes: C, odd. Finer bins need more of them to brake as hard.
+        reach: largest displacement in bins.
         turn: largest change of heading per metre moved, by class [rad/m].
         interpolation: ``"quadratic"`` moves at constant acceleration inside a decision, ``"linear"`` at constant speed.
         frame: ``"current"`` measures along the current heading, ``"scene"`` along the axes of the scene.
 
     Raises:
-        ValueError: an unknown option, or a bin that is not positive.
+        ValueError: an unknown option, a bin that is not positive, an even number of changes, or no reach.
 
     Examples:
         >>> tokenizer = VerletTokenizer()
@@ -70,6 +72,8 @@ class VerletTokenizer(MotionTokenizer):
         steps: int = 5,
         *,
         bins: Mapping[str, tuple[float, float]] = DEFAULT_BINS,
+        changes: int = CHANGES,
+        reach: int = REACH,
         turn: Mapping[str, float] = DEFAULT_TURN,
         interpolation: Interpolation = "quadratic",
         frame: Frame = "current",
@@ -79,41 +83,46 @@ class VerletTokenizer(MotionTokenizer):
             raise ValueError(f"interpolation must be 'linear' or 'quadratic', got {interpolation!r}.")
         if frame not in ("current", "scene"):
             raise ValueError(f"frame must be 'current' or 'scene', got {frame!r}.")
-        self.vocab_size = CHANGES**2
-        self.steps = steps
+        if changes < 1 or changes % 2 == 0:
+            raise ValueError(f"changes must be an odd number of 1 or more, as many each way, got {changes}.")
+        if reach < 1:
+            raise ValueError(f"reach must be 1 bin or more, got {reach}.")
+        self.vocab_size, self.steps = changes**2, steps
+        self.changes, self.reach = changes, reach
         self.interpolation = interpolation
         self.frame = frame
         self.register_buffer("bins", _by_kind("bins", bins, 2))
         self.register_buffer("turn", _by_kind("turn", turn, 1)[:, 0])
 
     def encode(self, target: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
-        """The change of displacement that ends nearest to the target, at most six bins each way."""
+        """The change of displacement that ends nearest to the target, of those there are."""
         end = self._from_own_frame(target[..., -1, :2], recent)
         bins = (end / self.bins[kind]).round()
-        change = (bins - self._last_bins(recent, kind)).clamp(-(CHANGES // 2), CHANGES // 2).long() + CHANGES // 2
-        return change[..., 0] * CHANGES + change[..., 1]
+        most = self.changes // 2
+        change = (bins - self._last_bins(recent, kind)).clamp(-most, most).long() + most
+        return change[..., 0] * self.changes + change[..., 1]
 
     def decode(self, token: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
-        """The motion at the changed displacement, at most :data:`MAX_BIN` bins each way."""
-        change = torch.stack((token // CHANGES, token % CHANGES), -1) - CHANGES // 2
+        """The motion at the changed displacement, at most ``reach`` bins each way."""
+        change = torch.stack((token // self.changes, token % self.changes), -1) - self.changes // 2
         last_bins = self._last_bins(recent, kind)
-        bins = (last_bins + change).clamp(-MAX_BIN, MAX_BIN)
+        bins = (last_bins + change).clamp(-self.reach, self.reach)
         last, end = (self._to_own_frame(b * self.bins[kind], recent) for b in (last_bins, bins))
         xy = self._interpolate(last, end)
         return torch.cat((xy, self._headings(xy, kind)[..., None]), -1)
 
     def neighbour(self, token: Tensor, kind: Tensor, drawn: Tensor) -> Tensor:
         """A change of at most one bin more or less in each direction."""
-        change = torch.stack((token // CHANGES, token % CHANGES), -1) + (3 * drawn).long() - 1
-        change = change.clamp(0, CHANGES - 1)
-        return change[..., 0] * CHANGES + change[..., 1]
+        change = torch.stack((token // self.changes, token % self.changes), -1) + (3 * drawn).long() - 1
+        change = change.clamp(0, self.changes - 1)
+        return change[..., 0] * self.changes + change[..., 1]
 
     def _last_bins(self, recent: Tensor, kind: Tensor) -> Tensor:
         """``[*, 2]``: displacement of the last decision in bins, in the frame that is measured in."""
         moved = recent[..., -1, :2] - recent[..., 0, :2]
         if self.frame == "current":
             moved = rotate(moved, -recent[..., -1, 2])
-        return (moved / self.bins[kind]).round().clamp(-MAX_BIN, MAX_BIN)
+        return (moved / self.bins[kind]).round().clamp(-self.reach, self.reach)
 
     def _from_own_frame(self, vector: Tensor, recent: Tensor) -> Tensor:
         return vector if self.frame == "current" else rotate(vector, recent[..., -1, 2])

@@ -42,7 +42,7 @@ COUNTS = (
     *("threads", "count", "parts", "shard_size", "chunk_scenes", "num_rollouts", "drift_rollouts", "kept", "each"),
     *("steps", "batch_size", "batch_scenes", "scenes_per_step", "pairs_per_scene", "max_rows", "stride", "width"),
     *("checkpoint_interval", "tune_interval", "watch_interval", "look_interval", "watch_scenes", "watch_pairs"),
-    *("decision_steps", "horizon", "max_controlled", "max_pieces", "patience", "pretraining.max_agents", "window"),
+    *("max_controlled", "max_pieces", "patience", "pretraining.max_agents", "window"),
     *("passes",),
 )
 BINS = ("bins.vehicle", "bins.pedestrian", "bins.cyclist")
@@ -50,7 +50,8 @@ LIMITS: dict[str, Limit] = {
     **dict.fromkeys(COUNTS, COUNT),
     **dict.fromkeys(("workers", "warmup", "staleness", "part", "top_k", "min_agents", "pictures.scenes"), NUMBER),
     **dict.fromkeys(
-        ("aligned_scenes", "scenes.limit", "select.max_agents", "submission_shards"), COUNT._replace(empty=True)
+        ("aligned_scenes", "horizon", "scenes.limit", "select.max_agents", "submission_shards"),
+        COUNT._replace(empty=True),
     ),
     **dict.fromkeys(("seed", "split_seed"), Limit(int)),
     **dict.fromkeys(("memory", "max_norm", "lr", "rms", "length", "piece_length", "temperature", "top_p"), POSITIVE),

@@ -11,48 +11,69 @@ from typing import Any
 
 import torch
 from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from dpa import zoo
 from dpa.models import MotionModel
 from dpa.models.registry import FAMILIES, build_model, size_of
-from dpa.tokens import MotionTokenizer, VerletTokenizer
+from dpa.tokens import KDisksTokenizer, MotionTokenizer, VerletTokenizer
 from dpa.training.checkpoint import CheckpointError, load_policy, load_weights, save_policy
-from envs.episode import EpisodeOptions
+from envs.episode import EPISODE_STEPS, EpisodeOptions
 from recipes.common.cli import CONFIG, build, plain
 
-TOKENIZERS = {"verlet": VerletTokenizer}
+TOKENIZERS: dict[str, type[MotionTokenizer]] = {"verlet": VerletTokenizer, "k_disks": KDisksTokenizer}
 """Tokenizers that a YAML can name; add a class of your own here (docs/how-to.md)."""
 
 
+def tokenizer_config(cfg: DictConfig) -> dict[str, Any]:
+    """What decides a tokenizer, from ``cfg.model.tokenizer``, as a checkpoint holds it.
+
+    Raises:
+        ValueError: there is no such tokenizer, or its file is none.
+    """
+    options = plain(cfg.tokenizer)
+    if options["name"] not in TOKENIZERS:
+        raise ValueError(f"model.tokenizer.name must be one of {sorted(TOKENIZERS)}, got {options['name']!r}.")
+    return {"name": options["name"], **TOKENIZERS[options["name"]].settled(**without_name(options))}
+
+
 def episode_options(cfg: DictConfig) -> EpisodeOptions:
-    """Who takes part, whom a policy moves and for how long, from ``cfg.model.episode``."""
-    return build(EpisodeOptions, cfg.episode, "model.episode")
+    """Who takes part, whom a policy moves and for how long, from ``cfg.model``: a decision lasts as long as a token."""
+    if "decision_steps" in cfg.episode:
+        raise ValueError("model.episode has no option 'decision_steps': a decision lasts as long as a token.")
+    steps = build_tokenizer(tokenizer_config(cfg)).steps
+    horizon = EPISODE_STEPS // steps if cfg.episode.horizon is None else cfg.episode.horizon
+    told = OmegaConf.merge(cfg.episode, {"horizon": horizon})
+    return build(EpisodeOptions, told, "model.episode", decision_steps=steps)
 
 
 def policy_config(cfg: DictConfig) -> dict[str, Any]:
     """Everything that decides a policy's shape, from ``cfg.model``: what a checkpoint is compared with."""
     size, episode = size_of(cfg.family, cfg.size), episode_options(cfg)
-    if cfg.tokenizer.name not in TOKENIZERS:
-        raise ValueError(f"model.tokenizer.name must be one of {sorted(TOKENIZERS)}, got {cfg.tokenizer.name!r}.")
-    tokenizer = build_tokenizer(plain(cfg.tokenizer))
-    if tokenizer.steps != episode.decision_steps:
-        raise ValueError(
-            f"a token of model.tokenizer.name={cfg.tokenizer.name} has {tokenizer.steps} poses and "
-            f"model.episode.decision_steps={episode.decision_steps}; they must be equal."
-        )
     return {
         "family": cfg.family,
         "model": size | {"horizon": episode.horizon, "dropout": cfg.dropout},
         "context": asdict(build(FAMILIES[cfg.family].context, cfg.context, "model.context")),
-        "tokenizer": plain(cfg.tokenizer),
+        "tokenizer": tokenizer_config(cfg),
         "episode": asdict(episode),
     }
 
 
 def build_policy(config: dict[str, Any]) -> MotionModel:
-    """A fresh policy from :func:`policy_config`."""
+    """A policy from :func:`policy_config`, whose weights are to be loaded."""
     return build_model(config, build_tokenizer(config["tokenizer"]))
+
+
+def fresh_policy(cfg: DictConfig) -> MotionModel:
+    """A policy that has learnt nothing, from ``cfg.model``."""
+    model = build_policy(policy_config(cfg))
+    model.tokenizer.fill(**without_name(plain(cfg.tokenizer)))
+    return model
+
+
+def without_name(section: Mapping[str, Any]) -> dict[str, Any]:
+    """The other options of a section."""
+    return {key: value for key, value in section.items() if key != "name"}
 
 
 def named_models() -> list[str]:
@@ -74,13 +95,12 @@ def named_model(name: str) -> MotionModel:
         48
     """
     with initialize_config_dir(CONFIG["config_path"], version_base=CONFIG["version_base"]):
-        return build_policy(policy_config(compose("pretrain", [f"model={name}"]).model))
+        return fresh_policy(compose("pretrain", [f"model={name}"]).model)
 
 
 def build_tokenizer(section: Mapping[str, Any]) -> MotionTokenizer:
     """The tokenizer that ``name`` of a section names, with the section's other options."""
-    options = {key: value for key, value in section.items() if key != "name"}
-    return build(TOKENIZERS[section["name"]], DictConfig(options), f"model.tokenizer ({section['name']})")
+    return build(TOKENIZERS[section["name"]], DictConfig(without_name(section)), f"model.tokenizer ({section['name']})")
 
 
 def write_policy(path: Path, model: MotionModel, config: dict[str, Any], metadata: dict[str, Any]) -> None:

@@ -56,6 +56,7 @@ SECTIONS = {
     "gap": ("threads", "scenes"),
     "references": ("threads", "scenes", "collection.ranking", "evaluation"),
     "tokens": ("threads", "scenes", "model"),
+    "vocabulary": ("threads", "scenes"),
     "look": ("threads", "scenes"),
     "validity": ("threads", "scenes"),
     "sensitivity": ("threads", "scenes"),

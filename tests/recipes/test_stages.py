@@ -1039,9 +1039,11 @@ def test_the_loss_of_tokenization_is_measured(run: Callable, options: Callable, 
     outcome = run("tokens", *options("tokens", f"json={tmp_path / 'tokens.json'}"))
     assert outcome.status == 0, outcome.err
     assert "[m]" in outcome.out and "[deg]" in outcome.out
-    errors = json.loads((tmp_path / "tokens.json").read_text())["errors"]
-    assert errors["vehicle all"]["position_mean"] < 0.2
-    assert errors["pedestrian all"] == {"poses": 0}
+    written = json.loads((tmp_path / "tokens.json").read_text())
+    assert written["errors"]["vehicle all"]["position_mean"] < 0.2
+    assert written["errors"]["pedestrian all"] == {"poses": 0}
+    log, through = (written["realism"][name] for name in ("log", "tokens"))
+    assert 0.5 < through["realism"] < log["realism"] < 1 and "log through tokens" in outcome.out
 
 
 # --- submission -----------------------------------------------------------------------------------------------------

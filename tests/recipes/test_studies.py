@@ -26,9 +26,10 @@ from envs.sources.synthetic import straight_road
 from recipes import validity
 from recipes.common.cli import CONFIG
 from recipes.common.models import build_policy, policies_of, policy_config, write_policy
-from recipes.ladder import BESIDES, table, tokenized_log
+from recipes.ladder import BESIDES, table
 from recipes.sensitivity import Variants
 from recipes.sensitivity import summarise as summarise_variants
+from recipes.studies.rungs import tokenized_log
 from recipes.studies.tables import StudyTable, tell
 from recipes.validity import compare_with, summarise, windows
 from tests.dpa.training.offline import wandb_history

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dpa.tokens import TokenizedTracks, VerletTokenizer
-from dpa.tokens.verlet import CHANGES, DEFAULT_BINS, DEFAULT_TURN, MAX_BIN
+from dpa.tokens.verlet import CHANGES, DEFAULT_BINS, DEFAULT_TURN, REACH
 from envs.geometry.frames import to_local, to_world, wrap_angle
 from envs.scene import AgentKind
 from envs.sources.synthetic import straight_road
@@ -54,6 +54,31 @@ def test_tokens_decode_to_poses_that_encode_to_the_same_tokens(
     assert again.tokens.tolist() == tokens.tolist()
     torch.testing.assert_close(again.poses, poses)
     assert again.valid.all()
+
+
+def test_finer_bins_with_as_hard_braking_lose_less_of_a_log() -> None:
+    scene = straight_road(6, seed=3)
+    log, valid = scene.agents.poses[:, 11:], scene.agents.valid[:, 11:]
+    half = {kind: tuple(width / 2 for width in widths) for kind, widths in DEFAULT_BINS.items()}
+    fine = VerletTokenizer(bins=half, changes=25, reach=2 * REACH)
+    errors = []
+    for tokenizer in (VerletTokenizer(), fine):
+        tracks = tokenizer.encode_tracks(log, valid, scene.agents.recent(5), scene.agents.kind)
+        errors.append((tracks.poses - log)[..., :2].norm(dim=-1).mean())
+        assert tokenizer.vocab_size == tokenizer.changes**2 > int(tracks.tokens.max())
+    assert errors[1] < 0.7 * errors[0]
+    hardest, keep = torch.tensor([[12]]), torch.tensor([[25 * 12 + 12]])
+    recent, kind = at_speed(6.0), torch.tensor([int(VEHICLE)])
+    moved = [fine.decode_tracks(token, recent, kind)[0, -1, 0] for token in (hardest, keep)]
+    coarse = VerletTokenizer().decode_tracks(torch.tensor([[6]]), recent, kind)[0, -1, 0]
+    torch.testing.assert_close(moved[0], coarse, atol=0.15, rtol=0)
+    assert moved[1] == pytest.approx(6.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("options", "message"), [({"changes": 12}, "odd number .* got 12"), ({"reach": 0}, "got 0")])
+def test_bins_that_make_no_tokens_are_refused(options: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        VerletTokenizer(**options)
 
 
 @FEW
@@ -161,7 +186,7 @@ def test_linear_interpolation_moves_at_constant_speed_inside_a_decision() -> Non
 def test_displacements_end_at_the_largest_bin() -> None:
     bin_size = DEFAULT_BINS["vehicle"][0]
     moves = torch.diff(decode(VerletTokenizer(), [token(6)] * 16, at_speed(0.0))[4::5, 0])
-    torch.testing.assert_close(moves[-4:], torch.full((4,), MAX_BIN * bin_size), atol=1e-3, rtol=0)
+    torch.testing.assert_close(moves[-4:], torch.full((4,), REACH * bin_size), atol=1e-3, rtol=0)
 
 
 # --- headings -------------------------------------------------------------------------------------------------------

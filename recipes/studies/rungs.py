@@ -1,0 +1,79 @@
+"""Rollouts that need no policy: the log itself, through tokens or with noise, constant velocity, random tokens."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from dpa.rollout import lifted
+from dpa.tokens import MotionTokenizer
+from envs.scene import CURRENT_STEP, STEP_SECONDS, Scene
+
+Rung = Callable[[Scene, int, torch.Generator], Tensor]
+"""Scene, number of rollouts and generator -> ``[R, A, 80, 4]``."""
+NOISE_XY, NOISE_HEADING = 0.1, 0.01
+"""Standard deviation of a noisy log's drift in one step [m], [rad]; it adds up to 0.9 m and 5 degrees at the end."""
+
+
+def logged(scene: Scene, num_rollouts: int, generator: torch.Generator) -> Tensor:
+    """The log in every rollout; where it has no step, the agent stays where it was last."""
+    return _log(scene).expand(num_rollouts, -1, -1, -1)
+
+
+def noisy_log(scene: Scene, num_rollouts: int, generator: torch.Generator) -> Tensor:
+    """The log with a drift of its own in every rollout."""
+    log = _log(scene)
+    noise = torch.randn(num_rollouts, *log.shape, generator=generator).cumsum(2)
+    return log + noise * torch.tensor([NOISE_XY, NOISE_XY, 0.0, NOISE_HEADING])
+
+
+def constant_velocity(scene: Scene, num_rollouts: int, generator: torch.Generator) -> Tensor:
+    """Every agent goes straight on at its speed of the current step, in every rollout."""
+    agents, log = scene.agents, _log(scene)
+    time = STEP_SECONDS * torch.arange(1, log.shape[1] + 1)
+    now = agents.present
+    xy = agents.position[now, CURRENT_STEP, None, :2] + agents.velocity[now, CURRENT_STEP, None] * time[:, None]
+    heading = agents.heading[now, CURRENT_STEP, None, None].expand(-1, log.shape[1], 1)
+    poses = torch.cat((xy, heading), -1)
+    return lifted(scene, poses[None]).expand(num_rollouts, -1, -1, -1)
+
+
+def random_tokens(tokenizer: MotionTokenizer) -> Rung:
+    """Every token as likely as any other, at every decision."""
+
+    def roll(scene: Scene, num_rollouts: int, generator: torch.Generator) -> Tensor:
+        recent, kind = _seen(scene, tokenizer.steps)
+        steps = _log(scene).shape[1] // tokenizer.steps
+        tokens = torch.randint(tokenizer.vocab_size, (num_rollouts, len(kind), steps), generator=generator)
+        return lifted(scene, tokenizer.decode_tracks(tokens, recent.expand(num_rollouts, -1, -1, -1), kind))
+
+    return roll
+
+
+def tokenized_log(tokenizer: MotionTokenizer) -> Rung:
+    """The log through tokens and back, in every rollout: the best that any model of these tokens could do alike."""
+
+    def roll(scene: Scene, num_rollouts: int, generator: torch.Generator) -> Tensor:
+        recent, kind = _seen(scene, tokenizer.steps)
+        poses = _log(scene)[..., [0, 1, 3]]
+        tracks = tokenizer.encode_tracks(poses, torch.ones(poses.shape[:2], dtype=torch.bool), recent, kind)
+        return lifted(scene, tracks.poses[None]).expand(num_rollouts, -1, -1, -1)
+
+    return roll
+
+
+def _seen(scene: Scene, steps: int) -> tuple[Tensor, Tensor]:
+    """What a policy sees of the present agents: ``[A, F + 1, 3]`` before the first decision, and their kinds."""
+    present = scene.agents.present
+    return scene.agents.recent(steps)[present], scene.agents.kind[present]
+
+
+def _log(scene: Scene) -> Tensor:
+    """``[A, 80, 4]`` of the present agents; a step that the log lacks has the pose of the last one that it has."""
+    agents = scene.agents
+    poses = torch.cat((agents.position, agents.heading[..., None]), -1)[agents.present, CURRENT_STEP:]
+    steps = torch.arange(poses.shape[1])
+    last = torch.where(agents.valid[agents.present, CURRENT_STEP:], steps, 0).cummax(1).values
+    return poses.gather(1, last[..., None].expand_as(poses))[:, 1:]
