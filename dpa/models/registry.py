@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
+from dpa.models import motionlm, smart
 from dpa.models.base import MotionModel
-from dpa.models.motionlm import SIZES, ContextOptions, MotionLM
 from dpa.tokens.base import MotionTokenizer
 
 
@@ -25,7 +25,10 @@ class Family(NamedTuple):
     context: Callable[..., Any]
 
 
-FAMILIES: dict[str, Family] = {"motionlm": Family(MotionLM, SIZES, ContextOptions)}
+FAMILIES: dict[str, Family] = {
+    "motionlm": Family(motionlm.MotionLM, motionlm.SIZES, motionlm.ContextOptions),
+    "smart": Family(smart.SMART, smart.SIZES, smart.SmartContextOptions),
+}
 """Families that a YAML can name; add one of your own here (docs/how-to.md)."""
 
 

@@ -79,6 +79,7 @@ class RolloutCollector(BaseCollector):
         """More tasks, after those that are known.
 
         Examples:
+            >>> from dpa.models.motionlm import MotionLM
             >>> from dpa.tokens import VerletTokenizer
             >>> from envs.sources.synthetic import straight_road
             >>> job = RolloutJob([straight_road(2)], MotionLM("nano", VerletTokenizer()), num_rollouts=2)
@@ -266,6 +267,7 @@ def make_collector(
         compile: the decoder, which pays for many scenes; see :class:`~dpa.models.MotionActor`.
 
     Examples:
+        >>> from dpa.models.motionlm import MotionLM
         >>> from dpa.tokens import VerletTokenizer
         >>> from envs.sources.synthetic import straight_road
         >>> model = MotionLM("nano", VerletTokenizer())

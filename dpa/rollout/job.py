@@ -96,6 +96,7 @@ class RolloutWorker:
         job: what to do with a task.
 
     Examples:
+        >>> from dpa.models.motionlm import MotionLM
         >>> from dpa.tokens import VerletTokenizer
         >>> from envs.sources.synthetic import straight_road
         >>> job = RolloutJob([straight_road(2)], MotionLM("nano", VerletTokenizer()), num_rollouts=4)

@@ -105,6 +105,7 @@ class LogItems:
         keep_gib: memory for what is kept, in each process that reads; once full, the rest is made anew each time.
 
     Examples:
+        >>> from dpa.models.motionlm import featurize
         >>> from dpa.tokens import VerletTokenizer
         >>> from envs.loader import SceneLoader
         >>> from envs.sources.synthetic import straight_road

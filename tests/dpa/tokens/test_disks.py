@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import pickle
 from pathlib import Path
 
 import numpy as np
@@ -160,11 +159,11 @@ def test_a_policy_brings_its_motions_in_its_weights() -> None:
     assert torch.equal(opened.tokenizer.points, tokenizer.points), "what follows from them is there as well"
 
 
-def test_it_travels_to_other_processes() -> None:
+def test_a_copy_takes_weights_as_well() -> None:
     tokenizer = tokenizer_of()
-    for again in (copy.deepcopy(tokenizer), pickle.loads(pickle.dumps(tokenizer))):
-        again.load_state_dict(tokenizer.state_dict())
-        assert torch.equal(again.points, tokenizer.points)
+    again = copy.deepcopy(tokenizer)  # a collector's workers have copies, whose weights change
+    again.load_state_dict(tokenizer.state_dict())
+    assert torch.equal(again.points, tokenizer.points)
 
 
 def test_a_file_settles_size_and_digest_and_another_one_is_refused(tmp_path: Path) -> None:

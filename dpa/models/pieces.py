@@ -1,0 +1,132 @@
+"""A map as policies read it: polylines cut into pieces, each with a pose, and the lights with theirs."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from envs.episode import HISTORY
+from envs.geometry.frames import rotate, wrap_angle
+from envs.scene import CURRENT_STEP, LOG_STEPS, STEP_SECONDS, Agents, Lights, LightState, RoadMap
+
+GRID = 4.0
+"""Places nearer to each other than this count as one in the choice of pieces [m]."""
+
+
+class Pieces(NamedTuple):
+    """Runs of the polylines of one scene, in the order of the map.
+
+    Attributes:
+        pose: ``[P, 3]`` middle of a piece, heading along it.
+        points: ``[P, n, 2]`` in the frame of the piece [m].
+        kind: ``[P]`` :class:`~envs.scene.MapKind`.
+        light: ``[P]`` light state of the piece's lane at the current step, plus one (0: none).
+        follows: ``[P]`` bool, the next piece goes on where this one ends.
+    """
+
+    pose: Tensor
+    points: Tensor
+    kind: Tensor
+    light: Tensor
+    follows: Tensor
+
+
+def places_ahead(agents: Agents, steps: int) -> Tensor:
+    """``[n, 2]``: where present agents are, and would be each second of an episode at constant velocity.
+
+    Args:
+        agents: of one uncollated scene.
+        steps: of 0.1 s, of the episode.
+    """
+    seconds = torch.arange(0.0, steps * STEP_SECONDS + 0.5)
+    ahead = agents.velocity[agents.present, CURRENT_STEP, None] * seconds[:, None]
+    places = (agents.position[agents.present, CURRENT_STEP, None, :2] + ahead).flatten(0, 1)
+    return torch.unique((places / GRID).round(), dim=0) * GRID  # the standing ones count once
+
+
+def cut_map(
+    road: RoadMap, lights: Lights, places: Tensor, *, length: float, num_points: int, most: int, slack: float = 0.0
+) -> Pieces:
+    """Cut a map into pieces and keep those nearest to some places.
+
+    Args:
+        road: of one uncollated scene.
+        lights: of the scene.
+        places: ``[n, 2]``.
+
+    Keyword Args:
+        length: target length of a piece [m].
+        num_points: that describe a piece, odd.
+        most: pieces that are kept.
+        slack: a cut may lie so far before its place [m]: with some, rounding moves no cut from point to point.
+    """
+    owner, start, end = _cut(road, length, slack)
+    points = _resample(road.points[:, :2], start, end, num_points)
+    middle = points[:, num_points // 2]
+    near = torch.cdist(middle, places).amin(1).argsort(stable=True)[:most]
+    near = near.sort().values  # map order, so that equal scenes give equal tensors
+    points, middle, owner = points[near], middle[near], owner[near]
+    chord = points[:, -1] - points[:, 0]
+    heading = torch.atan2(chord[:, 1], chord[:, 0])
+    local = rotate(points - middle[:, None], -heading[:, None])
+    state = torch.zeros(len(road.kind), dtype=torch.int64)
+    for lane, now in zip(lights.lane_id.tolist(), lights.state[:, CURRENT_STEP].tolist(), strict=True):
+        state[road.feature_id == lane] = now + 1
+    follows = torch.cat(((near[1:] == near[:-1] + 1) & (owner[1:] == owner[:-1]), owner.new_zeros(1, dtype=torch.bool)))
+    pose = torch.cat((middle, heading[:, None]), -1)
+    return Pieces(pose, local, road.kind[owner], state[owner], follows[: len(owner)])
+
+
+def _cut(road: RoadMap, length: float, slack: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Cut polylines into runs of points: owner, first and last point of each run, all ``[pieces]``."""
+    step = (road.points[1:, :2] - road.points[:-1, :2]).norm(dim=-1)
+    arc = torch.cat((step.new_zeros(1), step.double().cumsum(0)))
+    first = road.start.clamp(max=len(arc) - 1)  # features without points may come last
+    last = first + (road.count - 1).clamp(min=0)
+    total = arc[last] - arc[first]
+    pieces = (total / length).ceil().clamp(min=1).long() * (road.count > 0)
+    owner = torch.repeat_interleave(torch.arange(len(pieces)), pieces)
+    number = torch.arange(len(owner)) - torch.repeat_interleave(pieces.cumsum(0) - pieces, pieces)
+    share = total[owner] / pieces[owner].clamp(min=1)
+    cut = torch.searchsorted(arc, arc[first][owner] + share * number - slack).clamp(first[owner], last[owner])
+    following = torch.cat((cut[1:], cut[:1]))
+    ends_line = torch.cat((owner[1:] != owner[:-1], torch.ones(min(1, len(owner)), dtype=torch.bool)))
+    return owner, cut, torch.where(ends_line, last[owner], following)
+
+
+def _resample(points: Tensor, start: Tensor, end: Tensor, num: int) -> Tensor:
+    """``[pieces, num, 2]``: points at equal shares of the indices of each run."""
+    share = torch.linspace(0, 1, num)
+    at = start[:, None] + (end - start)[:, None] * share
+    low = at.floor().long()
+    high = torch.minimum(low + 1, end[:, None])
+    return torch.lerp(points[low], points[high], (at - low)[..., None].to(points.dtype))
+
+
+def light_poses(road: RoadMap, lights: Lights) -> Tensor:
+    """``[G, 3]``: stop points, headed along the lane at its nearest point; 0 heading for a lane that the map lacks."""
+    poses = torch.zeros(len(lights.lane_id), 3)
+    if not len(poses):
+        return poses
+    listed = lights.state[:, :HISTORY] != LightState.ABSENT
+    latest = torch.where(listed.any(-1), HISTORY - 1 - listed.flip(-1).int().argmax(-1), LOG_STEPS - 1)
+    poses[:, :2] = lights.stop_point[torch.arange(len(poses)), latest, :2]
+    lane = (road.feature_id == lights.lane_id[:, None]) & (road.count > 1)
+    known = lane.any(-1)
+    if known.any():
+        owner = lane[known].int().argmax(-1)
+        poses[known, 2] = _lane_headings(road, owner, poses[known, :2])
+    return poses
+
+
+def _lane_headings(road: RoadMap, owner: Tensor, places: Tensor) -> Tensor:
+    """``[n]``: heading of each place's polyline, ``owner``, which has two points or more, at its nearest point."""
+    first, last = road.start[owner], road.count[owner] - 1
+    along = torch.arange(int(last.max()) + 1)
+    points = road.points[(first[:, None] + along.minimum(last[:, None])), :2]
+    nearest = (points - places[:, None]).norm(dim=-1).masked_fill(along > last[:, None], torch.inf).argmin(-1)
+    rows = torch.arange(len(owner))
+    ahead = points[rows, (nearest + 1).minimum(last)] - points[rows, (nearest - 1).clamp(min=0)]
+    return wrap_angle(torch.atan2(ahead[:, 1], ahead[:, 0]))

@@ -1,0 +1,177 @@
+"""What every family must do: the same decision by decision as in one pass, wherever a scene lies, whoever is padded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+
+from dpa.models import Contexts, MotionActor, MotionModel, collate_contexts, make_context
+from dpa.models.context import keep_agents, pad_context
+from dpa.models.registry import FAMILIES, build_model, size_of
+from dpa.tokens import KDisksTokenizer, MotionTokenizer, TokenAction, VerletTokenizer
+from envs import keys
+from envs.episode import EpisodeOptions
+from envs.scene import Scene
+from envs.traffic import TrafficEnv
+
+SMALLEST = {"motionlm": "nano", "smart": "nano"}
+families = pytest.mark.parametrize("family", sorted(SMALLEST))
+
+
+def make(family: str, tokenizer: MotionTokenizer | None = None, horizon: int = 16) -> MotionModel:
+    """A small policy whose parameters are all non-zero."""
+    torch.manual_seed(0)
+    size = size_of(family, SMALLEST[family]) | {"horizon": horizon}
+    model = build_model({"family": family, "model": size, "context": {}}, tokenizer or VerletTokenizer()).eval()
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.05 * torch.randn(parameter.shape, generator=generator))
+    return model
+
+
+def drive(model: MotionModel, scenes: list[Scene], episode: EpisodeOptions, rollouts: int = 2) -> TensorDictBase:
+    env = TrafficEnv(scenes, episode, num_scenes=len(scenes), num_rollouts=rollouts)
+    actor = MotionActor(model, Contexts(scenes, model.featurize, episode), num_rollouts=rollouts)
+    return TransformedEnv(env, TokenAction(model.tokenizer)).rollout(episode.horizon, actor)
+
+
+@torch.no_grad()
+def forced(model: MotionModel, scenes: list[Scene], episode: EpisodeOptions, rolled: TensorDictBase) -> Tensor:
+    """``[B, A, T]`` log-probabilities of the tokens of rollouts, of one teacher-forced pass."""
+    contexts = collate_contexts([make_context(scene, model.featurize, episode) for scene in scenes])
+    tokens = rolled[keys.TOKEN].transpose(1, 2).unflatten(0, (len(scenes), -1))
+    context = pad_context(contexts, tokens.shape[2])
+    valid = context.episode.controlled[:, None, :, None].expand(-1, 1, -1, tokens.shape[-1])
+    log_probs = model(context, tokens, valid).log_softmax(-1)
+    return log_probs.gather(-1, tokens[..., None])[..., 0].flatten(0, 1)
+
+
+OPTIONS = {
+    "plain": EpisodeOptions(),
+    "two controlled": EpisodeOptions(max_controlled=2),
+    "arrivals": EpisodeOptions(arrivals=True, max_controlled=3),
+    "short": EpisodeOptions(horizon=5),
+}
+
+
+@families
+@pytest.mark.parametrize("episode", OPTIONS.values(), ids=OPTIONS)
+def test_decision_by_decision_is_as_in_one_pass(family: str, episode: EpisodeOptions, scene: Callable) -> None:
+    model, scenes = make(family), [scene(4, seed=1), scene(6, seed=2)]
+    rolled = drive(model, scenes, episode, rollouts=3)
+    written, controlled = (rolled[key].transpose(1, 2) for key in (keys.LOG_PROB, keys.CONTROLLED))
+    expected = forced(model, scenes, episode, rolled)
+    torch.testing.assert_close(written[controlled], expected[controlled], atol=1e-5, rtol=0)
+    assert written[controlled].std() > 0.1, "tokens differ in how likely they are"
+
+
+@families
+@pytest.mark.parametrize("steps", [2, 4, 10])
+def test_decisions_of_any_length_are_as_in_one_pass(family: str, steps: int, scene: Callable) -> None:
+    episode = EpisodeOptions(decision_steps=steps, horizon=min(80 // steps, 12))
+    model, scenes = make(family, VerletTokenizer(steps=steps), episode.horizon), [scene(3, seed=1)]
+    rolled = drive(model, scenes, episode)
+    written, controlled = (rolled[key].transpose(1, 2) for key in (keys.LOG_PROB, keys.CONTROLLED))
+    expected = forced(model, scenes, episode, rolled)
+    torch.testing.assert_close(written[controlled], expected[controlled], atol=1e-5, rtol=0)
+
+
+@families
+def test_tokens_of_logged_motions_are_as_in_one_pass(family: str, scene: Callable) -> None:
+    motions = torch.rand(5, 30, 5, 3, generator=torch.Generator().manual_seed(0)) - 0.3
+    model, scenes = make(family, KDisksTokenizer.of(motions)), [scene(3, seed=1)]
+    rolled = drive(model, scenes, EpisodeOptions())
+    written, controlled = (rolled[key].transpose(1, 2) for key in (keys.LOG_PROB, keys.CONTROLLED))
+    expected = forced(model, scenes, EpisodeOptions(), rolled)
+    torch.testing.assert_close(written[controlled], expected[controlled], atol=1e-5, rtol=0)
+
+
+def logits_of(model: MotionModel, context: object, tokens: Tensor) -> Tensor:
+    valid = torch.ones(1, 1, *tokens.shape[2:], dtype=torch.bool)
+    with torch.no_grad():
+        return model(collate_contexts([context]), tokens, valid)
+
+
+def tokens_for(agents: int, rollouts: int = 2) -> Tensor:
+    return torch.randint(60, 110, (1, rollouts, agents, 16), generator=torch.Generator().manual_seed(1))
+
+
+@families
+@pytest.mark.parametrize("motion", [(300.0, -80.0, 0.0), (0.0, 0.0, 2.5), (-40.0, 120.0, -1.2)])
+def test_where_a_scene_lies_changes_nothing(family: str, motion: tuple, scene: Callable, move: Callable) -> None:
+    model, tokens = make(family), tokens_for(3)
+    here, there = scene(3), move(scene(3), torch.tensor(motion))
+    mine, other = (logits_of(model, make_context(each, model.featurize), tokens) for each in (here, there))
+    torch.testing.assert_close(other, mine, atol=2e-3, rtol=0)
+
+
+@families
+def test_a_token_is_seen_from_the_next_decision_on(family: str, scene: Callable) -> None:
+    model, tokens = make(family), tokens_for(4)
+    context, other = make_context(scene(4, leave=False), model.featurize), tokens.clone()
+    other[..., 1, 6] = 13 * 12
+    left, right = logits_of(model, context, tokens), logits_of(model, context, other)
+    assert torch.equal(left[..., :7, :], right[..., :7, :])
+    changed = (left != right).any(-1)
+    assert changed[..., 1, 7:].all() and changed[..., 7:].any()
+
+
+@families
+def test_padding_and_the_order_of_agents_change_nothing(family: str, scene: Callable) -> None:
+    model, tokens = make(family), tokens_for(6)
+    small, large = (make_context(scene(count, seed=count), model.featurize) for count in (2, 6))
+    alone = logits_of(model, small, tokens[:, :, :2])
+    with torch.no_grad():
+        valid = torch.ones(2, 1, 6, 16, dtype=torch.bool)
+        both = model(collate_contexts([small, large]), tokens.expand(2, -1, -1, -1), valid)
+    torch.testing.assert_close(both[:1, :, :2], alone, atol=1e-5, rtol=0)
+    order = torch.tensor([3, 0, 5, 1, 4, 2])
+    shuffled = logits_of(model, keep_agents(large, order), tokens[:, :, order])
+    torch.testing.assert_close(shuffled, logits_of(model, large, tokens)[:, :, order], atol=1e-5, rtol=0)
+
+
+@families
+def test_a_scene_without_a_map_and_gradients_of_all_parameters(family: str, scene: Callable) -> None:
+    model, tokens = make(family).train(), tokens_for(4)
+    contexts = collate_contexts([make_context(scene(4), model.featurize)])
+    model(contexts, tokens, torch.ones(1, 1, 4, 16, dtype=torch.bool)).square().mean().backward()
+    without = [name for name, parameter in model.named_parameters() if parameter.grad is None]
+    assert not without
+    assert all(parameter.grad.isfinite().all() for parameter in model.parameters())
+    empty = scene(2)
+    empty.road.count[:] = 0
+    assert logits_of(model.eval(), make_context(empty, model.featurize), tokens_for(2)).isfinite().all()
+
+
+@families
+def test_rows_that_begin_again_have_no_past(family: str, scene: Callable) -> None:
+    model, scenes = make(family), [scene(3, seed=1), scene(4, seed=2)]
+    episode = EpisodeOptions(horizon=6)
+    model.config = replace(model.config, horizon=6) if hasattr(model.config, "horizon") else model.config
+    env = TransformedEnv(TrafficEnv(scenes, episode, num_scenes=2, num_rollouts=2), TokenAction(model.tokenizer))
+    actor = MotionActor(model, Contexts(scenes, model.featurize, episode), num_rollouts=2)
+    with torch.no_grad():
+        state = env.reset()
+        for _ in range(3):
+            state = env.step(actor(state))["next"].exclude("reward")
+        rows = torch.tensor([True, False, False, False])[:, None]
+        again = env.reset(state.set("_reset", rows))
+        logits = actor.logits(again.clone())
+        fresh = MotionActor(model, Contexts(scenes, model.featurize, episode), num_rollouts=2)
+        expected = fresh.logits(env.reset())
+    torch.testing.assert_close(logits[0, :3], expected[0, :3], atol=1e-5, rtol=0)
+
+
+def test_every_family_is_tested() -> None:
+    assert set(FAMILIES) - {"habit"} == set(SMALLEST)
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])
