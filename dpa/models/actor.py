@@ -80,7 +80,7 @@ class MotionActor(TensorDictModuleBase):
         self.num_rollouts, self.first_rollout = num_rollouts, first_rollout
         self.decoding, self.precision = decoding or Decoding(top_p=1.0), check_precision(precision)
         self._memory = model.remember(compile=compile)
-        self._due: Tensor | None = None  # [B], the decision that each row takes next
+        self._due: list[int] = []  # the decision that each row takes next
         self._last: Tensor | None = None  # [B, A], tokens of the decision before
         self.set_seed(seed)
 
@@ -98,12 +98,14 @@ class MotionActor(TensorDictModuleBase):
     def logits(self, tensordict: TensorDictBase) -> Tensor:
         """``[B, A, V]`` of the decision at hand, which the memory keeps."""
         recent, step = tensordict[keys.RECENT], tensordict[keys.STEP][:, 0]
-        self._start(tensordict)
-        self._due = step + 1
+        at = step.tolist()  # all that is read back from the device in a decision
+        self._start(tensordict, at)
+        self._due = [each + 1 for each in at]
         controlled = tensordict[keys.CONTROLLED]
         last = torch.where((step[:, None] > 0) & controlled, self._last, self.model.no_token)
         with running_in(self.precision, recent.device):
-            return self._memory.step(Observation(recent, last, step, tensordict[keys.KIND], tensordict[keys.VALID]))
+            seen = Observation(recent, last, step, max(at), tensordict[keys.KIND], tensordict[keys.VALID])
+            return self._memory.step(seen)
 
     def set_seed(self, seed: int) -> None:
         """Seed the sampling anew: the rollouts that begin from now on are the first ones of this seed."""
@@ -111,40 +113,40 @@ class MotionActor(TensorDictModuleBase):
         self._begun: dict[tuple[int, int], int] = {}
 
     # --- the start of episodes --------------------------------------------------------------------------------------
-    def _start(self, tensordict: TensorDictBase) -> None:
+    def _start(self, tensordict: TensorDictBase, at: list[int]) -> None:
         """Look at the scenes of which an episode starts, and draw the numbers that decide the rollouts that do."""
         step, shape = tensordict[keys.STEP][:, 0], tensordict[keys.VALID].shape
         if shape[0] % self.num_rollouts:
             raise ValueError(f"num_rollouts must divide the batch of {shape[0]} rows, got {self.num_rollouts}.")
-        scene, begins = tensordict[keys.SCENE], step == 0
-        self._check_order(step)
-        if (step == 1).any():
-            self._count(scene, step)
-        if not begins.any():
+        self._check_order(at)
+        if 1 in at:
+            self._count(tensordict[keys.SCENE].tolist(), at)
+        if 0 not in at:
             return
-        anew = self._last is None or self._last.shape != shape or bool(begins.all())
+        scene, begins = tensordict[keys.SCENE].tolist(), [row for row, each in enumerate(at) if each == 0]
+        anew = self._last is None or self._last.shape != shape or len(begins) == len(at)
         if anew:
             self._last = torch.full(shape, self.model.no_token, device=step.device)
             self._noise = torch.zeros(shape[0], self.model.config.horizon, shape[1])
-            begins = torch.ones_like(begins)
-            self._scenes = scene.view(-1, self.num_rollouts)[:, 0].clone()
-        fresh = begins.view(-1, self.num_rollouts).any(-1)
+            begins = list(range(len(at)))
+            self._scenes = scene[:: self.num_rollouts]
         # Padding depends on the scenes of a batch, so a change of some encodes all: rare, and cheap beside the episode.
-        self._scenes[fresh] = scene.view(-1, self.num_rollouts)[:, 0][fresh]
-        context = collate_contexts([self.contexts[i] for i in self._scenes.tolist()]).to(step.device)
+        for row in begins:
+            self._scenes[row // self.num_rollouts] = scene[row - row % self.num_rollouts]
+        context = collate_contexts([self.contexts[i] for i in self._scenes]).to(step.device)
         context = pad_context(context, shape[1])
         self._check_agents(context, tensordict, step == 0)
         self._context = context
         with running_in(self.precision, step.device):
             self._memory.begin(context, self.num_rollouts, anew)
-        self._draw_noise(begins.nonzero()[:, 0].tolist(), scene.tolist())
+        self._draw_noise(begins, scene)
 
-    def _check_order(self, step: Tensor) -> None:
-        due = self._due if self._due is not None and self._due.shape == step.shape else torch.zeros_like(step)
-        if ((step > 0) & (step != due)).any():
+    def _check_order(self, at: list[int]) -> None:
+        due = self._due if len(self._due) == len(at) else [0] * len(at)
+        if any(each not in (0, own) for each, own in zip(at, due, strict=True)):
             raise ValueError(
-                f"decisions of a rollout must follow each other from 0 on, got {step.tolist()} where {due.tolist()} or "
-                "0 was due; reset the environment, and give each environment an actor of its own."
+                f"decisions of a rollout must follow each other from 0 on, got {at} where {due} or 0 was due; reset "
+                "the environment, and give each environment an actor of its own."
             )
 
     def _check_agents(self, context: Context, tensordict: TensorDictBase, begins: Tensor) -> None:
@@ -158,10 +160,10 @@ class MotionActor(TensorDictModuleBase):
                     "both the same scenes, arrivals, decision_steps and horizon."
                 )
 
-    def _count(self, scene: Tensor, step: Tensor) -> None:
+    def _count(self, scene: list[int], at: list[int]) -> None:
         """An episode has begun when it takes its second decision: a collector may try a policy out on the first one."""
-        for row in (step == 1).nonzero()[:, 0].tolist():
-            named = (int(scene[row]), self.first_rollout + row % self.num_rollouts)
+        for row in (row for row, each in enumerate(at) if each == 1):
+            named = (scene[row], self.first_rollout + row % self.num_rollouts)
             self._begun[named] = self._begun.get(named, 0) + 1
 
     def _draw_noise(self, rows: list[int], scene: list[int]) -> None:

@@ -18,6 +18,7 @@ class Observation(NamedTuple):
         recent: ``[B, A, F + 1, 3]`` poses of the last decision.
         token: ``[B, A]`` token of it; V where there is none.
         step: ``[B]`` index of the decision.
+        latest: the largest of these, known without asking the device.
         kind: ``[B, A]`` :class:`~envs.scene.AgentKind`.
         valid: ``[B, A]`` bool, the agent is there.
     """
@@ -25,6 +26,7 @@ class Observation(NamedTuple):
     recent: Tensor
     token: Tensor
     step: Tensor
+    latest: int
     kind: Tensor
     valid: Tensor
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.data import Categorical, Composite
 from torchrl.envs import Transform
 
@@ -36,13 +37,19 @@ class TokenAction(Transform):
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         token = tensordict[keys.TOKEN]
-        # A token outside the vocabulary would be decoded to a motion that none has.
-        if not bool(((token >= 0) & (token < self.tokenizer.vocab_size)).all()):
+        self._check(token)
+        action = self.tokenizer.decode(token, tensordict[keys.RECENT], tensordict[keys.KIND])
+        return tensordict.set(keys.ACTION, action)
+
+    def _check(self, token: Tensor) -> None:
+        """Refuse a token outside the vocabulary, which would be decoded to a motion that none has."""
+        inside = ((token >= 0) & (token < self.tokenizer.vocab_size)).all()
+        if token.device.type != "cpu":  # where it is told without waiting for the device
+            torch._assert_async(inside, f"tokens must be 0 to {self.tokenizer.vocab_size - 1}.")
+        elif not inside:
             raise ValueError(
                 f"tokens must be 0 to {self.tokenizer.vocab_size - 1}, got {int(token.min())} to {int(token.max())}."
             )
-        action = self.tokenizer.decode(token, tensordict[keys.RECENT], tensordict[keys.KIND])
-        return tensordict.set(keys.ACTION, action)
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Tokens in the place of poses."""

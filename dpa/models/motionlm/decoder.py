@@ -218,15 +218,16 @@ class NodeCache:
         """Forget all nodes: what is in the buffers is not looked at any more."""
         self.valid.zero_()
 
-    def start(self, step: Tensor, valid: Tensor) -> NodeMasks:
+    def start(self, step: Tensor, latest: int, valid: Tensor) -> NodeMasks:
         """Begin a decision and get its masks: each row sees the nodes up to its own decision.
 
         Args:
             step: ``[B]`` int64 decision of each row.
+            latest: the largest of these.
             valid: ``[B, A]`` bool nodes.
         """
         self._rows, self._step = torch.arange(len(step), device=step.device), step
-        self._last = int(step.max()) + 1
+        self._last = latest + 1
         self.valid[self._rows, step] = valid
         earlier = torch.arange(self._last, device=step.device) <= step[:, None]
         everybody = (self.valid[:, : self._last] & earlier[..., None]).flatten(1)[:, None, None, :]

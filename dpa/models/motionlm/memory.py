@@ -42,7 +42,7 @@ class RolloutMemory:
 
     def step(self, seen: Observation) -> Tensor:
         """See :meth:`dpa.models.base.Memory.step`."""
-        masks = self._cache.start(seen.step, seen.valid)
+        masks = self._cache.start(seen.step, seen.latest, seen.valid)
         when = seen.step[:, None].expand_as(seen.token)
         nodes = NodeInputs(seen.recent, seen.token, when, seen.kind, seen.valid)
         return self._decode(nodes, self._scenes, masks, self._cache)

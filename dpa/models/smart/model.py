@@ -316,7 +316,9 @@ class SmartMemory:
         early, there = self.model.history(context)
         for recent, valid in zip(early.unbind(1), there.unbind(1), strict=True):
             token = torch.full_like(episode.kind, self.model.no_token)
-            _, past = self._advance(past, Observation(recent, token, None, episode.kind, valid), episode.extent)
+            _, past = self._advance(
+                past, Observation(recent, token, torch.zeros_like(token[:, 0]), 0, episode.kind, valid), episode.extent
+            )
         return past
 
     def step(self, seen: Observation) -> Tensor:

@@ -1,0 +1,159 @@
+"""Policies stay on their device: a tensor elsewhere, or a number that is read back, fails here and not on a user's GPU.
+
+There is no GPU here. PyTorch runs on a device that computes nothing (fake tensors know shapes, types and devices), a
+registered one of its own, since a build for CPUs has no CUDA to pretend. A process that has registered it is no good
+for anything else, so ``test_device.py`` runs these cases in one of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import deepcopy
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTensorDeviceMismatchError, FakeTensorMode
+from torch.utils import backend_registration
+
+from dpa.losses import ContrastivePreferenceLoss, NextTokenLoss, PolicyGradientLoss, token_network
+from dpa.models import MotionModel, collate_contexts, make_context
+from dpa.models.base import Observation
+from dpa.models.registry import build_model, size_of
+from dpa.tokens import KDisksTokenizer, MotionTokenizer, VerletTokenizer
+
+DEVICE = "nowhere"
+SMALLEST = {"motionlm": "nano", "smart": "nano"}
+families = pytest.mark.parametrize("family", sorted(SMALLEST))
+TOKENIZERS: dict[str, Callable[[], MotionTokenizer]] = {
+    "verlet": VerletTokenizer,
+    "k_disks": lambda: KDisksTokenizer.of(torch.rand(5, 30, 5, 3)),
+}
+
+
+class Nowhere(backend_registration._DummyBackendModule):
+    """What autocast asks of a device."""
+
+    def get_amp_supported_dtype(self) -> list[torch.dtype]:
+        return [torch.bfloat16, torch.float16]
+
+
+@pytest.fixture(scope="module")
+def elsewhere() -> FakeTensorMode:
+    """A mode in which tensors are on :data:`DEVICE`."""
+    if torch._C._get_privateuse1_backend_name() != DEVICE:
+        backend_registration._setup_privateuseone_for_python_backend(DEVICE, Nowhere())
+    return FakeTensorMode()
+
+
+def moved(mode: FakeTensorMode, value: Tensor) -> Tensor:
+    with mode:
+        return torch.empty_strided(value.shape, value.stride(), dtype=value.dtype, device=DEVICE)
+
+
+def module_there(mode: FakeTensorMode, module: nn.Module) -> nn.Module:
+    """A copy whose parameters and buffers are there."""
+    module = deepcopy(module)
+    for part in module.modules():
+        for held in (part._parameters, part._buffers):
+            for name, value in held.items():
+                if value is not None:
+                    there = moved(mode, value.detach())
+                    held[name] = nn.Parameter(there) if held is part._parameters else there
+    return module
+
+
+def policy(family: str, tokenizer: MotionTokenizer) -> MotionModel:
+    config = {"family": family, "model": size_of(family, SMALLEST[family]), "context": {}}
+    return build_model(config, tokenizer)
+
+
+@pytest.fixture
+def batch(scene: Callable, elsewhere: FakeTensorMode) -> Callable[..., TensorDict]:
+    """Makes a batch of two scenes for a loss, there."""
+
+    def make(model: MotionModel, **entries: Tensor) -> TensorDict:
+        contexts = [make_context(scene(count, seed=count), model.featurize) for count in (3, 5)]
+        context = collate_contexts(contexts).apply(lambda value: moved(elsewhere, value))
+        content = {name: moved(elsewhere, value) for name, value in entries.items()}
+        with elsewhere:
+            return TensorDict({"context": context, **content}, batch_size=[2])
+
+    return make
+
+
+def test_the_device_is_one_that_tells_mistakes(elsewhere: FakeTensorMode) -> None:
+    with elsewhere:
+        there, here = torch.ones(3, device=DEVICE), torch.ones(3)
+        with pytest.raises(FakeTensorDeviceMismatchError):
+            there + here
+        with pytest.raises(DataDependentOutputException):
+            there.sum().item()
+
+
+TOKENS, VALID = torch.zeros(2, 3, 5, 16, dtype=torch.int64), torch.ones(2, 1, 5, 16, dtype=torch.bool)
+
+
+@families
+@pytest.mark.parametrize("make_tokenizer", TOKENIZERS.values(), ids=TOKENIZERS)
+def test_a_pass_and_its_gradients_stay_on_the_device(
+    family: str, make_tokenizer: Callable, batch: Callable, elsewhere: FakeTensorMode
+) -> None:
+    model = policy(family, make_tokenizer())
+    given = batch(model, tokens=TOKENS, valid=VALID)
+    there = module_there(elsewhere, model)
+    with elsewhere:
+        logits = there(given["context"], given["tokens"], given["valid"])
+        assert logits.device.type == DEVICE and logits.shape == (2, 3, 5, 16, model.tokenizer.vocab_size)
+        logits.sum().backward()
+    assert all(parameter.grad.device.type == DEVICE for parameter in there.parameters() if parameter.grad is not None)
+
+
+LOSSES: dict[str, tuple[Callable, dict[str, Tensor]]] = {
+    "next token": (NextTokenLoss, {"tokens": TOKENS[:, :1], "labels": TOKENS[:, :1], "token_valid": VALID}),
+    "pairs": (ContrastivePreferenceLoss, {"preferred": TOKENS, "unpreferred": TOKENS, "token_valid": VALID}),
+    "policy gradient": (
+        PolicyGradientLoss,
+        {"tokens": TOKENS, "token_valid": VALID, "advantage": torch.zeros(2, 3, 5, 16),
+         "sample_log_prob": torch.zeros(2, 3, 5, 16)},
+    ),
+}  # fmt: skip
+
+
+@families
+@pytest.mark.parametrize(("make_loss", "entries"), LOSSES.values(), ids=LOSSES)
+def test_losses_stay_on_the_device(
+    family: str, make_loss: Callable, entries: dict, batch: Callable, elsewhere: FakeTensorMode
+) -> None:
+    model = policy(family, VerletTokenizer())
+    given = batch(model, **entries)
+    there = module_there(elsewhere, model)
+    with elsewhere:
+        found = make_loss(token_network(there))(given)
+        total = sum(value for name, value in found.items() if name.startswith("loss_"))
+        assert total.device.type == DEVICE
+        total.backward()
+
+
+@families
+def test_a_decision_of_running_rollouts_stays_on_the_device(
+    family: str, batch: Callable, elsewhere: FakeTensorMode
+) -> None:
+    model, shape = policy(family, VerletTokenizer()).eval(), (6, 5)
+    given = batch(model)
+    there = module_there(elsewhere, model)
+    with elsewhere, torch.no_grad():
+        memory = there.remember()
+        memory.begin(given["context"], 3, anew=True)
+        whole = {"dtype": torch.int64, "device": DEVICE}
+        for _ in range(2):
+            seen = Observation(
+                torch.empty(*shape, 6, 3, device=DEVICE), torch.empty(shape, **whole), torch.empty(6, **whole), 1,
+                torch.empty(shape, **whole), torch.empty(shape, dtype=torch.bool, device=DEVICE),
+            )  # fmt: skip
+            assert memory.step(seen).device.type == DEVICE
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])
