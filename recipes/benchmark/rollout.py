@@ -95,7 +95,7 @@ class UncachedActor(MotionActor):
         """``[B, A, V]`` of the decision at hand; all rows stand at the same one."""
         step, scene = int(tensordict[keys.STEP][0, 0]), tensordict[keys.SCENE]
         if step == 0:
-            self._start(tensordict)
+            self._start(tensordict, [0] * len(scene))
             self._taken = torch.zeros(*tensordict[keys.VALID].shape, self.model.config.horizon, dtype=torch.int64)
             self._taken = self._taken.to(scene.device)
         else:
