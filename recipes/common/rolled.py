@@ -65,7 +65,7 @@ def driven(
     Args:
         scenes: to roll out.
         model: of the rollouts.
-        options: how the model cuts scenes up, and whom it drives.
+        options: of the episodes.
         cfg: with ``num_rollouts``, ``decoding``, ``seed``, ``memory`` and ``device``.
     """
     batches = make_collector(
@@ -91,7 +91,7 @@ def stored(
         rows: positions in the store.
         scenes: that the store is of.
         model: that made its rollouts; only its tokenizer is asked.
-        options: how the model cuts scenes up.
+        options: of the episodes.
     """
     for row in rows:
         index = int(store.scenes[row])

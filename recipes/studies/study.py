@@ -108,7 +108,7 @@ def rolled_out(
         cfg: with ``decoding``, ``seed``, ``memory`` and ``device``.
         scenes: to roll out.
         model: that drives.
-        options: how it cuts scenes up.
+        options: of the episodes.
         num_rollouts: of each scene.
         done: indices of the scenes to leave out.
         name: of the bar.
