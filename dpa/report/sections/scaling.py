@@ -88,8 +88,8 @@ def _against_kl(experiment: Experiment, colours: Mapping[str, str]) -> list[Char
         )
     )
     title = "Realism against the distance from the reference"
-    shown = {"x": "KL to the reference [nats per token]", "y": "difference in realism", "caption": caption, "zero": True}
-    return [curves(content, title, **shown)] if content else []
+    axes = {"x": "KL to the reference [nats per token]", "y": "difference in realism"}
+    return [curves(content, title, **axes, caption=caption, zero=True)] if content else []
 
 
 def _drift(
