@@ -293,7 +293,9 @@ def test_scaling_stands_over_its_axis_with_intervals(page: Page, runs: Path) -> 
 
 
 def test_snapshots_stand_over_their_distance_from_the_reference_in_order_of_steps(page: Page, runs: Path) -> None:
-    figure = next(each for each in figures(page, "KL to the reference [nats per token]") if "DPA-OMF" in each["data"][0]["name"])
+    figure = next(
+        each for each in figures(page, "KL to the reference [nats per token]") if "DPA-OMF" in each["data"][0]["name"]
+    )
     line = trace(figure, "DPA-OMF, own best")
     assert line["x"] == pytest.approx([0, 0.1, 0.2, 0.3])
     paired = {entry["method"]: entry for entry in read(runs, "experiments/steps.json")["own_best"]["paired"]}
@@ -302,7 +304,9 @@ def test_snapshots_stand_over_their_distance_from_the_reference_in_order_of_step
 
 
 def test_what_is_scaled_stands_over_the_distance_from_the_reference_too(page: Page, runs: Path) -> None:
-    figure = next(each for each in figures(page, "KL to the reference [nats per token]") if "rankings" in each["data"][0]["name"])
+    figure = next(
+        each for each in figures(page, "KL to the reference [nats per token]") if "rankings" in each["data"][0]["name"]
+    )
     line = trace(figure, "rankings per scene, own best")
     found = read(runs, "experiments/scaling.json")
     kl = [np.mean([row["kl"] for row in found["likelihood"] if row["method"] == name]) for name in ("r1", "r4", "r16")]
