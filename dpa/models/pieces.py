@@ -23,14 +23,12 @@ class Pieces(NamedTuple):
         points: ``[P, n, 2]`` in the frame of the piece [m].
         kind: ``[P]`` :class:`~envs.scene.MapKind`.
         light: ``[P]`` light state of the piece's lane at the current step, plus one (0: none).
-        follows: ``[P]`` bool, the next piece goes on where this one ends.
     """
 
     pose: Tensor
     points: Tensor
     kind: Tensor
     light: Tensor
-    follows: Tensor
 
 
 def places_ahead(agents: Agents, steps: int) -> Tensor:
@@ -74,9 +72,8 @@ def cut_map(
     state = torch.zeros(len(road.kind), dtype=torch.int64)
     for lane, now in zip(lights.lane_id.tolist(), lights.state[:, CURRENT_STEP].tolist(), strict=True):
         state[road.feature_id == lane] = now + 1
-    follows = torch.cat(((near[1:] == near[:-1] + 1) & (owner[1:] == owner[:-1]), owner.new_zeros(1, dtype=torch.bool)))
     pose = torch.cat((middle, heading[:, None]), -1)
-    return Pieces(pose, local, road.kind[owner], state[owner], follows[: len(owner)])
+    return Pieces(pose, local, road.kind[owner], state[owner])
 
 
 def _cut(road: RoadMap, length: float, slack: float) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,8 +1,7 @@
-"""What SMART sees of a scene: short map pieces as tokens of a small vocabulary of shapes, and its agents."""
+"""What SMART sees of a scene: short map pieces, and its agents."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -10,17 +9,12 @@ import torch
 from tensordict import TensorClass
 from torch import Tensor
 
-from dpa.models.pieces import Pieces, cut_map, places_ahead
+from dpa.models.pieces import cut_map, places_ahead
 from envs.episode import Episode
 from envs.scene import Scene
 
 PIECE_POINTS = 3
 """Points that describe a piece."""
-BENDS, LENGTHS = 64, 16
-"""Shapes are told apart by how far a piece bends and how long it is: 1,024 of them."""
-MOST_BEND = math.pi / 2
-"""Bends beyond it count as it [rad]."""
-NUM_SHAPES = BENDS * LENGTHS
 SLACK = 0.01
 """Of a cut [m]: pieces are of the length of a few points, where rounding would move cuts from one to the next."""
 
@@ -53,8 +47,6 @@ class SmartContext(TensorClass["nocast"]):
         episode: its agents.
         map_pose: ``[*, P, 3]`` middle of a piece, heading along it.
         map_points: ``[*, P, PIECE_POINTS, 2]`` in the frame of the piece [m].
-        map_shape: ``[*, P]`` its shape, one of :data:`NUM_SHAPES`.
-        map_follows: ``[*, P]`` bool, the next piece goes on where this one ends.
         map_kind: ``[*, P]`` :class:`~envs.scene.MapKind`.
         map_light: ``[*, P]`` light state of the piece's lane at the current step, plus one (0: none).
         map_valid: ``[*, P]`` bool.
@@ -64,8 +56,6 @@ class SmartContext(TensorClass["nocast"]):
     episode: Episode
     map_pose: Tensor
     map_points: Tensor
-    map_shape: Tensor
-    map_follows: Tensor
     map_kind: Tensor
     map_light: Tensor
     map_valid: Tensor
@@ -89,21 +79,8 @@ def featurize(scene: Scene, episode: Episode, options: SmartContextOptions | Non
         episode=episode,
         map_pose=pieces.pose,
         map_points=pieces.points,
-        map_shape=shapes(pieces, options.piece_length),
-        map_follows=pieces.follows,
         map_kind=pieces.kind,
         map_light=pieces.light,
         map_valid=torch.ones(len(pieces.kind), dtype=torch.bool),
         batch_size=[],
     )
-
-
-def shapes(pieces: Pieces, length: float) -> Tensor:
-    """``[P]``: the bend of a piece and its length, as one number below :data:`NUM_SHAPES`."""
-    first, last = (pieces.points[:, 1] - pieces.points[:, 0], pieces.points[:, 2] - pieces.points[:, 1])
-    turned = torch.atan2(last[:, 1], last[:, 0]) - torch.atan2(first[:, 1], first[:, 0])
-    turned = torch.remainder(turned + math.pi, 2 * math.pi) - math.pi
-    bend = ((turned.clamp(-MOST_BEND, MOST_BEND) / MOST_BEND + 1) / 2 * (BENDS - 1)).round().long()
-    run = (pieces.points[:, 2] - pieces.points[:, 0]).norm(dim=-1)
-    long = (run / (2 * length) * LENGTHS).long().clamp(max=LENGTHS - 1)
-    return bend * LENGTHS + long

@@ -13,15 +13,12 @@ from torch import Tensor, nn
 from dpa.models.base import Memory, MotionModel, Observation
 from dpa.models.context import Featurize
 from dpa.models.forcing import shown_by
-from dpa.models.smart.context import NUM_SHAPES, PIECE_POINTS, SmartContext, SmartContextOptions, featurize
+from dpa.models.smart.context import PIECE_POINTS, SmartContext, SmartContextOptions, featurize
 from dpa.models.smart.edges import METRES, SECONDS, EdgeAttention, Edges, FourierEmbedding, nearest, relative
 from dpa.tokens.base import MotionTokenizer
 from envs.episode import HISTORY
 from envs.geometry.frames import to_local, to_world
 from envs.scene import NUM_MAP_KINDS, STEP_SECONDS, AgentKind, LightState
-
-HIDDEN = NUM_SHAPES
-"""Shape of a piece that is hidden, whose own is to be predicted."""
 
 
 @dataclass(frozen=True)
@@ -73,18 +70,6 @@ SIZES: dict[str, SmartConfig] = {
                         agent_pieces=64, agents=32),
 }  # fmt: skip
 """Named sizes; parameters are those published, within 10 %, with a vocabulary of 2,048."""
-
-
-class Nodes(NamedTuple):
-    """Agents of R rollouts at some decisions, flat: a row for each.
-
-    Attributes:
-        x: ``[N, width]``.
-        pose: ``[N, 3]``.
-    """
-
-    x: Tensor
-    pose: Tensor
 
 
 class AgentLayer(nn.Module):
