@@ -25,7 +25,7 @@ from envs.geometry.frames import wrap_angle
 from envs.progress import progress
 from envs.scene import STEP_SECONDS, AgentKind, SceneSource
 from recipes.common.cli import CONFIG, recipe
-from recipes.common.models import episode_options, fresh_policy, policy_config
+from recipes.common.models import episode_options, fresh_policy, tokenizer_config
 from recipes.common.scenes import open_splits
 from recipes.studies.rungs import logged, tokenized_log
 
@@ -127,8 +127,10 @@ def main(cfg: DictConfig) -> None:
         realistic.add_row("log through tokens" if name == "tokens" else name, *(f"{row[key]:.3f}" for key in BUCKETS))
     Console(markup=False).print(realistic)
     if cfg.json is not None:
-        config = policy_config(cfg.model)["tokenizer"]
-        write_json(cfg.json, {"tokenizer": config, "scenes": len(scenes), "errors": errors, "realism": left})
+        write_json(
+            cfg.json,
+            {"tokenizer": tokenizer_config(cfg.model), "scenes": len(scenes), "errors": errors, "realism": left},
+        )
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
 from torch import Tensor, nn
@@ -94,3 +95,16 @@ class MotionModel(nn.Module, ABC):
     @abstractmethod
     def bytes_per_row(self) -> int:
         """Memory of one agent of one rollout while it runs: what is kept of it, and what a decision computes."""
+
+
+def named_size(config: Any, sizes: Mapping[str, Any]) -> Any:
+    """The configuration itself, or the one of its name.
+
+    Raises:
+        ValueError: a name that is no size.
+    """
+    if not isinstance(config, str):
+        return config
+    if config not in sizes:
+        raise ValueError(f"size must be one of {sorted(sizes)}, got {config!r}.")
+    return sizes[config]

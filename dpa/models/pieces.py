@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -9,10 +10,31 @@ from torch import Tensor
 
 from envs.episode import HISTORY
 from envs.geometry.frames import rotate, wrap_angle
-from envs.scene import CURRENT_STEP, LOG_STEPS, STEP_SECONDS, Agents, Lights, LightState, RoadMap
+from envs.scene import CURRENT_STEP, LOG_STEPS, STEP_SECONDS, Agents, Lights, LightState, RoadMap, Scene
 
 GRID = 4.0
 """Places nearer to each other than this count as one in the choice of pieces [m]."""
+
+
+@dataclass(frozen=True)
+class PieceOptions:
+    """How a map is cut up.
+
+    Attributes:
+        max_pieces: pieces kept, those nearest to where any present agent is or may soon be.
+        piece_length: target length of a piece [m].
+
+    Raises:
+        ValueError: a number that is not positive.
+    """
+
+    max_pieces: int
+    piece_length: float
+
+    def __post_init__(self) -> None:
+        for name in ("max_pieces", "piece_length"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
 
 
 class Pieces(NamedTuple):
@@ -23,15 +45,17 @@ class Pieces(NamedTuple):
         points: ``[P, n, 2]`` in the frame of the piece [m].
         kind: ``[P]`` :class:`~envs.scene.MapKind`.
         light: ``[P]`` light state of the piece's lane at the current step, plus one (0: none).
+        valid: ``[P]`` bool, all of them.
     """
 
     pose: Tensor
     points: Tensor
     kind: Tensor
     light: Tensor
+    valid: Tensor
 
 
-def places_ahead(agents: Agents, steps: int) -> Tensor:
+def _places_ahead(agents: Agents, steps: int) -> Tensor:
     """``[n, 2]``: where present agents are, and would be each second of an episode at constant velocity.
 
     Args:
@@ -44,26 +68,21 @@ def places_ahead(agents: Agents, steps: int) -> Tensor:
     return torch.unique((places / GRID).round(), dim=0) * GRID  # the standing ones count once
 
 
-def cut_map(
-    road: RoadMap, lights: Lights, places: Tensor, *, length: float, num_points: int, most: int, slack: float = 0.0
-) -> Pieces:
-    """Cut a map into pieces and keep those nearest to some places.
+def cut_map(scene: Scene, steps: int, options: PieceOptions, num_points: int, slack: float = 0.0) -> Pieces:
+    """Cut the map of one uncollated scene into pieces and keep those nearest to where its agents may be.
 
     Args:
-        road: of one uncollated scene.
-        lights: of the scene.
-        places: ``[n, 2]``.
-
-    Keyword Args:
-        length: target length of a piece [m].
+        scene: as it was recorded.
+        steps: of 0.1 s, of the episode.
+        options: length and number of pieces.
         num_points: that describe a piece, odd.
-        most: pieces that are kept.
         slack: a cut may lie so far before its place [m]: with some, rounding moves no cut from point to point.
     """
-    owner, start, end = _cut(road, length, slack)
+    road, lights, places = scene.road, scene.lights, _places_ahead(scene.agents, steps)
+    owner, start, end = _cut(road, options.piece_length, slack)
     points = _resample(road.points[:, :2], start, end, num_points)
     middle = points[:, num_points // 2]
-    near = torch.cdist(middle, places).amin(1).argsort(stable=True)[:most]
+    near = torch.cdist(middle, places).amin(1).argsort(stable=True)[: options.max_pieces]
     near = near.sort().values  # map order, so that equal scenes give equal tensors
     points, middle, owner = points[near], middle[near], owner[near]
     chord = points[:, -1] - points[:, 0]
@@ -73,7 +92,7 @@ def cut_map(
     for lane, now in zip(lights.lane_id.tolist(), lights.state[:, CURRENT_STEP].tolist(), strict=True):
         state[road.feature_id == lane] = now + 1
     pose = torch.cat((middle, heading[:, None]), -1)
-    return Pieces(pose, local, road.kind[owner], state[owner])
+    return Pieces(pose, local, road.kind[owner], state[owner], torch.ones(len(owner), dtype=torch.bool))
 
 
 def _cut(road: RoadMap, length: float, slack: float) -> tuple[Tensor, Tensor, Tensor]:

@@ -10,11 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-import torch
 from tensordict import TensorClass
 from torch import Tensor
 
-from dpa.models.pieces import cut_map, light_poses, places_ahead
+from dpa.models.pieces import PieceOptions, cut_map, light_poses
 from envs.episode import HISTORY, Episode
 from envs.scene import CURRENT_STEP, LightState, Scene
 
@@ -26,24 +25,11 @@ NUM_LIGHT_STATES = len(LightState)
 
 
 @dataclass(frozen=True)
-class ContextOptions:
-    """How a scene is cut up for MotionLM.
-
-    Attributes:
-        max_pieces: map pieces kept, those nearest to where any present agent is or may soon be.
-        piece_length: target length of a map piece [m].
-
-    Raises:
-        ValueError: a number that is not positive.
-    """
+class ContextOptions(PieceOptions):
+    """How a scene is cut up for MotionLM."""
 
     max_pieces: int = 512
     piece_length: float = 12.0
-
-    def __post_init__(self) -> None:
-        for name in ("max_pieces", "piece_length"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
 
 
 class SceneContext(TensorClass["nocast"]):
@@ -84,15 +70,10 @@ def featurize(scene: Scene, episode: Episode, options: ContextOptions | None = N
         torch.Size([5, 2])
     """
     options = options or ContextOptions()
-    cut = {"length": options.piece_length, "num_points": PIECE_POINTS, "most": options.max_pieces}
-    pieces = cut_map(scene.road, scene.lights, places_ahead(scene.agents, episode.logged.shape[-2]), **cut)
+    pieces = cut_map(scene, episode.logged.shape[-2], options, PIECE_POINTS)
     return SceneContext(
         episode=episode,
-        map_pose=pieces.pose,
-        map_points=pieces.points,
-        map_kind=pieces.kind,
-        map_light=pieces.light,
-        map_valid=torch.ones(len(pieces.kind), dtype=torch.bool),
+        **{f"map_{name}": value for name, value in pieces._asdict().items()},
         light_pose=light_poses(scene.road, scene.lights),
         light_state=scene.lights.state[:, :HISTORY] + 1,
         light_valid=scene.lights.state[:, CURRENT_STEP] != LightState.ABSENT,

@@ -8,7 +8,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from dpa.models.base import MotionModel
+from dpa.models.base import MotionModel, named_size
 from dpa.models.context import Featurize
 from dpa.models.forcing import shown_by
 from dpa.models.motionlm.attention import GAZE, NodeMasks, added
@@ -76,10 +76,7 @@ class MotionLM(MotionModel):
         self, config: MotionLMConfig | str, tokenizer: MotionTokenizer, context: ContextOptions | None = None
     ) -> None:
         super().__init__()
-        if isinstance(config, str):
-            if config not in SIZES:
-                raise ValueError(f"size must be one of {sorted(SIZES)}, got {config!r}.")
-            config = SIZES[config]
+        config = named_size(config, SIZES)
         self.config, self.tokenizer, self.context = config, tokenizer, context or ContextOptions()
         size = (config.width, config.heads, config.feed)
         self.encoder = SceneEncoder(*size, config.encoder_layers, config.dropout)

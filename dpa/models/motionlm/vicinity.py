@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from dpa.models.neighbours import gather, nearest, rows_of
 from envs.geometry.frames import to_local
 
 SCALE = 10.0
@@ -54,8 +55,9 @@ class Vicinity(nn.Module):
         Returns:
             ``[B, Q, width]``; what no token contributes to is 0 before the last layer.
         """
-        near, index = self._nearest(pose, token_pose, mask)
-        relative = to_local(_gather(token_pose, index), pose[..., None, :])
+        square, index = nearest(pose, token_pose, mask, self.nearest)
+        near = square.sqrt()
+        relative = to_local(gather(token_pose, index), pose[..., None, :])
         features = torch.cat(
             (relative[..., :2] / SCALE, relative[..., 2:].cos(), relative[..., 2:].sin(), near[..., None] / SCALE), -1
         )
@@ -68,7 +70,7 @@ class Vicinity(nn.Module):
         """``[B, Q, width]``: the maximum over what each of the nearest tokens says."""
         # Part by part, so that what lies between two layers stays in the cache of a CPU: twice as fast.
         nodes = CPU_NODES if tokens.device.type == "cpu" else len(tokens) * index.shape[1]
-        table, rows = self.token(tokens).flatten(0, 1) + self.relative.bias, _rows(tokens, index)
+        table, rows = self.token(tokens).flatten(0, 1) + self.relative.bias, rows_of(tokens, index)
         parts = zip(*(value.flatten(0, 1).split(nodes) for value in (rows, features, seen)), strict=True)
         pooled = [self._pool_part(table, *part) for part in parts]
         return torch.cat(pooled).view(*index.shape[:2], -1)
@@ -79,23 +81,3 @@ class Vicinity(nn.Module):
         each = self.inner(said).view(*rows.shape, -1)
         # GELU is bounded below, so that an unseen token, at that bound, never wins the maximum.
         return each.masked_fill(~seen, LOWEST).amax(-2)
-
-    @torch.no_grad()
-    def _nearest(self, pose: Tensor, token_pose: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Distances ``[B, Q, k]`` (infinite where there is nothing) and indices of the nearest tokens."""
-        dx = pose[:, :, None, 0] - token_pose[:, None, :, 0]
-        dy = pose[:, :, None, 1] - token_pose[:, None, :, 1]
-        square = torch.addcmul(dx.square(), dy, dy).masked_fill(~mask, torch.inf)
-        near, index = square.topk(min(self.nearest, square.shape[-1]), largest=False, sorted=False)
-        return near.sqrt(), index
-
-
-def _rows(values: Tensor, index: Tensor) -> Tensor:
-    """Indices ``[B, Q, k]`` into ``[B, n]`` as indices into ``[B * n]``."""
-    return torch.arange(len(values), device=values.device)[:, None, None] * values.shape[1] + index
-
-
-def _gather(values: Tensor, index: Tensor) -> Tensor:
-    """``[B, n, d]`` at ``[B, Q, k]`` to ``[B, Q, k, d]``."""
-    # The gradient of index_select is one sum by row; that of indexing with tensors is many times slower on a CPU.
-    return values.flatten(0, 1).index_select(0, _rows(values, index).flatten()).view(*index.shape, -1)

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-import torch
 from tensordict import TensorClass
 from torch import Tensor
 
-from dpa.models.pieces import cut_map, places_ahead
+from dpa.models.pieces import PieceOptions, cut_map
 from envs.episode import Episode
 from envs.scene import Scene
 
@@ -20,24 +19,11 @@ SLACK = 0.01
 
 
 @dataclass(frozen=True)
-class SmartContextOptions:
-    """How a scene is cut up for SMART.
-
-    Attributes:
-        max_pieces: map pieces kept, those nearest to where any present agent is or may soon be.
-        piece_length: target length of a map piece [m].
-
-    Raises:
-        ValueError: a number that is not positive.
-    """
+class SmartContextOptions(PieceOptions):
+    """How a scene is cut up for SMART."""
 
     max_pieces: int = 768
     piece_length: float = 5.0
-
-    def __post_init__(self) -> None:
-        for name in ("max_pieces", "piece_length"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
 
 
 class SmartContext(TensorClass["nocast"]):
@@ -72,15 +58,9 @@ def featurize(scene: Scene, episode: Episode, options: SmartContextOptions | Non
         torch.Size([3, 2])
     """
     options = options or SmartContextOptions()
-    places = places_ahead(scene.agents, episode.logged.shape[-2])
-    cut = {"length": options.piece_length, "num_points": PIECE_POINTS, "most": options.max_pieces, "slack": SLACK}
-    pieces = cut_map(scene.road, scene.lights, places, **cut)
+    pieces = cut_map(scene, episode.logged.shape[-2], options, PIECE_POINTS, SLACK)
     return SmartContext(
         episode=episode,
-        map_pose=pieces.pose,
-        map_points=pieces.points,
-        map_kind=pieces.kind,
-        map_light=pieces.light,
-        map_valid=torch.ones(len(pieces.kind), dtype=torch.bool),
+        **{f"map_{name}": value for name, value in pieces._asdict().items()},
         batch_size=[],
     )

@@ -86,27 +86,6 @@ def relative(receiver: Tensor, sender: Tensor) -> Tensor:
     return torch.cat((local[..., :2] / METRES, local[..., 2:].cos(), local[..., 2:].sin()), -1)
 
 
-@torch.no_grad()
-def nearest(pose: Tensor, others: Tensor, mask: Tensor, most: int, radius: float) -> tuple[Tensor, Tensor]:
-    """The nearest things within a radius of each node.
-
-    Args:
-        pose: ``[B, Q, 3]`` of the nodes.
-        others: ``[B, n, 3]``.
-        mask: broadcastable to ``[B, Q, n]`` bool, true where a node may look.
-        most: neighbours at most.
-        radius: [m].
-
-    Returns:
-        Indices into ``n`` and validity, ``[B, Q, K]`` each.
-    """
-    dx = pose[:, :, None, 0] - others[:, None, :, 0]
-    dy = pose[:, :, None, 1] - others[:, None, :, 1]
-    square = torch.addcmul(dx.square(), dy, dy).masked_fill(~mask, torch.inf)
-    near, index = square.topk(min(most, square.shape[-1]), largest=False, sorted=False)
-    return index, near <= radius**2
-
-
 class EdgeAttention(nn.Module):
     """Attention of nodes to their neighbours, whose keys and values know the relative pose; gated, then a feed-forward.
 

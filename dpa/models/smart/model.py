@@ -10,11 +10,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from dpa.models.base import Memory, MotionModel, Observation
+from dpa.models.base import Memory, MotionModel, Observation, named_size
 from dpa.models.context import Featurize
 from dpa.models.forcing import shown_by
+from dpa.models.neighbours import gather, nearest, rows_of
 from dpa.models.smart.context import PIECE_POINTS, SmartContext, SmartContextOptions, featurize
-from dpa.models.smart.edges import METRES, SECONDS, EdgeAttention, Edges, FourierEmbedding, nearest, relative
+from dpa.models.smart.edges import METRES, SECONDS, EdgeAttention, Edges, FourierEmbedding, relative
 from dpa.tokens.base import MotionTokenizer
 from envs.episode import HISTORY
 from envs.geometry.frames import to_local, to_world
@@ -110,10 +111,7 @@ class SMART(MotionModel):
         self, config: SmartConfig | str, tokenizer: MotionTokenizer, context: SmartContextOptions | None = None
     ) -> None:
         super().__init__()
-        if isinstance(config, str):
-            if config not in SIZES:
-                raise ValueError(f"size must be one of {sorted(SIZES)}, got {config!r}.")
-            config = SIZES[config]
+        config = named_size(config, SIZES)
         self.config, self.tokenizer, self.context = config, tokenizer, context or SmartContextOptions()
         width = config.width
         self.piece = _mlp(PIECE_POINTS * 2, width)
@@ -140,8 +138,7 @@ class SMART(MotionModel):
         points = context.map_points.flatten(-2) / METRES
         x = self.piece(points) + self.piece_kind(context.map_kind) + self.piece_light(context.map_light)
         pose, valid, config = context.map_pose, context.map_valid, self.config
-        index, near = nearest(pose, pose, valid[:, None], config.map_pieces, config.map_radius)
-        edges = self._edges(self.map_edge, pose, pose, index, near)
+        edges = self._edges(self.map_edge, pose, pose, valid[:, None], config.map_pieces, config.map_radius)
         x = x.flatten(0, 1)
         for layer in self.map_layers:
             x = layer(x, layer.remember(x), edges)
@@ -194,25 +191,26 @@ class SMART(MotionModel):
         motion = self.motion(torch.cat((moved[..., :2] / METRES, length / METRES, turned, extent / METRES), -1))
         return motion + self.token(token) + self.kind(kind)
 
-    def _edges(self, embed: FourierEmbedding, pose: Tensor, others: Tensor, index: Tensor, valid: Tensor) -> Edges:
-        """Edges from ``[B, Q]`` nodes to ``[B, n]`` things at ``index`` ``[B, Q, K]``."""
-        rows = torch.arange(len(index), device=index.device)[:, None, None] * others.shape[1] + index
-        there = others.flatten(0, 1).index_select(0, rows.flatten()).view(*index.shape, 3)
-        feature = embed(relative(pose[:, :, None], there))
-        return Edges(rows.flatten(0, 1), valid.flatten(0, 1), feature.flatten(0, 1))
+    def _edges(
+        self, embed: FourierEmbedding, pose: Tensor, others: Tensor, mask: Tensor, most: int, radius: float
+    ) -> Edges:
+        """Edges from ``[B, Q]`` nodes to the nearest of ``[B, n]`` things in a mask, within a radius."""
+        square, index = nearest(pose, others, mask, most)
+        feature = embed(relative(pose[:, :, None], gather(others, index)))
+        there = (rows_of(others, index), square <= radius**2, feature)
+        return Edges(*(value.flatten(0, 1) for value in there))
 
     def map_edges(self, context: SmartContext, pose: Tensor) -> Edges:
         """From agents ``[R, A, 3]``, as many rows for each scene, to the pieces of their scene."""
         options = (self.config.agent_pieces, self.config.agent_map_radius)
         pose = pose.unflatten(0, (len(context.map_pose), -1)).flatten(1, 2)
-        index, near = nearest(pose, context.map_pose, context.map_valid[:, None], *options)
-        return self._edges(self.agent_map_edge, pose, context.map_pose, index, near)
+        return self._edges(self.agent_map_edge, pose, context.map_pose, context.map_valid[:, None], *options)
 
     def agent_edges(self, pose: Tensor, valid: Tensor) -> Edges:
         """Among the agents ``[R, A, 3]`` of one decision."""
         others = ~torch.eye(pose.shape[1], dtype=torch.bool, device=pose.device)
-        index, near = nearest(pose, pose, valid[:, None] & others, self.config.agents, self.config.agent_radius)
-        return self._edges(self.agent_edge, pose, pose, index, near)
+        options = (self.config.agents, self.config.agent_radius)
+        return self._edges(self.agent_edge, pose, pose, valid[:, None] & others, *options)
 
     def _past_edges(self, pose: Tensor, valid: Tensor, decisions: int) -> Edges:
         """From each node ``[B * T, A]`` to the same agent at the decisions before."""
@@ -267,9 +265,10 @@ class Past(NamedTuple):
     pose: Tensor
     there: Tensor
 
-    def map(self, change: Callable[[Tensor], Tensor]) -> Past:
-        """The same with every tensor changed."""
-        return Past(tuple(map(change, self.keys)), change(self.pose), change(self.there))
+    def map(self, change: Callable[..., Tensor], *others: Past) -> Past:
+        """Every tensor changed, together with those of others."""
+        keys, pose, there = zip(self, *others, strict=True)
+        return Past(tuple(map(change, *keys)), change(*pose), change(*there))
 
 
 class SmartMemory:
@@ -308,12 +307,7 @@ class SmartMemory:
 
     def step(self, seen: Observation) -> Tensor:
         """See :meth:`dpa.models.base.Memory.step`."""
-        begins = seen.step == 0
-        before = Past(*(
-            tuple(starting(begins, *each) for each in zip(mine, theirs, strict=True)) if isinstance(mine, tuple)
-            else starting(begins, mine, theirs)
-            for mine, theirs in zip(self._logged, self._past, strict=True)
-        ))  # fmt: skip
+        before = self._logged.map(partial(starting, seen.step == 0), self._past)
         x, self._past = self._advance(before, seen, self._extent)
         return self.model.head(self.model.norm(x))
 
@@ -329,9 +323,8 @@ class SmartMemory:
             x = layer.map(x, pieces, map_edges)
             x = layer.agents(x, layer.agents.remember(x), agent_edges)
         newest = Past(tuple(keys), pose[:, None], seen.valid[:, None])
-        joined = [torch.cat((new, old[:, :-1]), 1) for new, old in zip(newest.keys, past.keys, strict=True)]
-        later = (torch.cat((new, old[:, :-1]), 1) for new, old in zip(newest[1:], past[1:], strict=True))
-        return x.unflatten(0, pose.shape[:2]), Past(tuple(joined), *later)
+        later = newest.map(lambda new, old: torch.cat((new, old[:, :-1]), 1), past)
+        return x.unflatten(0, pose.shape[:2]), later
 
     def _edges(self, past: Past, pose: Tensor) -> Edges:
         """From each agent to itself at the decisions before."""
