@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import Protocol
 
 import torch
 from tensordict import TensorDictBase
@@ -10,11 +11,72 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from dpa.models.base import MotionModel, Observation
+from dpa.models.base import Decision, MotionModel, Observation
 from dpa.models.context import Context, Contexts, collate_contexts, pad_context
 from dpa.models.precision import Precision, check_precision, running_in
 from dpa.models.sampling import Decoding, draw, rollout_noise
 from envs import keys
+
+
+class Chooser(Protocol):
+    """A :class:`~dpa.models.base.Choose` that remembers by which log-probabilities it chose.
+
+    Attributes:
+        log_prob: ``[B, A]``, those of what has been chosen so far; 0 where nothing is drawn.
+    """
+
+    log_prob: Tensor
+
+    def __call__(self, logits: Tensor, agents: Tensor | None = None) -> Tensor:
+        """See :class:`~dpa.models.base.Choose`."""
+
+
+class Draw:
+    """Draws from a distribution made from that of the model.
+
+    Args:
+        uniform: ``[B, A]`` numbers in [0, 1) that decide.
+        decoding: the distribution.
+    """
+
+    def __init__(self, uniform: Tensor, decoding: Decoding) -> None:
+        self.uniform, self.decoding, self.log_prob = uniform, decoding, torch.zeros_like(uniform)
+
+    def __call__(self, logits: Tensor, agents: Tensor | None = None) -> Tensor:
+        """See :class:`Chooser`."""
+        log_probs = self.decoding.log_probs(logits)
+        token = draw(log_probs, of_agents(self.uniform, agents))
+        by = log_probs.gather(-1, token[..., None])[..., 0]
+        self.log_prob = by if agents is None else self.log_prob.scatter(1, agents, by)
+        return token
+
+
+class Likeliest:
+    """Takes the most probable token.
+
+    Args:
+        like: ``[B, A]``, gives shape and device.
+    """
+
+    def __init__(self, like: Tensor) -> None:
+        self.log_prob = torch.zeros_like(like)
+
+    def __call__(self, logits: Tensor, agents: Tensor | None = None) -> Tensor:
+        """See :class:`Chooser`."""
+        return logits.argmax(-1)
+
+
+def of_agents(value: Tensor, agents: Tensor | None) -> Tensor:
+    """``[B, A, ...]`` of some agents ``[B, n]``, or of all.
+
+    Examples:
+        >>> of_agents(torch.tensor([[10, 11, 12]]), torch.tensor([[2]]))
+        tensor([[12]])
+    """
+    if agents is None:
+        return value
+    index = agents.view(*agents.shape, *(1,) * (value.dim() - 2)).expand(*agents.shape, *value.shape[2:])
+    return value.gather(1, index)
 
 
 class MotionActor(TensorDictModuleBase):
@@ -87,30 +149,41 @@ class MotionActor(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write a token for every agent and its log-probabilities."""
-        logits = self.logits(tensordict).float()
-        token, sampling = self._sample(logits, tensordict[keys.STEP][:, 0])
-        self._last = token
+        (token, logits), chooser = self.decide(tensordict)
         tensordict[keys.TOKEN] = token
         tensordict[keys.LOG_PROB] = logits.log_softmax(-1).gather(-1, token[..., None])[..., 0]
-        tensordict[keys.SAMPLING_LOG_PROB] = sampling
+        tensordict[keys.SAMPLING_LOG_PROB] = chooser.log_prob
         return tensordict
 
-    def logits(self, tensordict: TensorDictBase) -> Tensor:
-        """``[B, A, V]`` of the decision at hand, which the memory keeps."""
-        recent, step = tensordict[keys.RECENT], tensordict[keys.STEP][:, 0]
-        at = step.tolist()  # all that is read back from the device in a decision
-        self._start(tensordict, at)
-        self._due = [each + 1 for each in at]
-        controlled = tensordict[keys.CONTROLLED]
-        last = torch.where((step[:, None] > 0) & controlled, self._last, self.model.no_token)
-        with running_in(self.precision, recent.device):
-            seen = Observation(recent, last, step, max(at), tensordict[keys.KIND], tensordict[keys.VALID])
-            return self._memory.step(seen)
+    def decide(self, tensordict: TensorDictBase) -> tuple[Decision, Chooser]:
+        """Take the decision at hand, which the memory keeps, and say how its tokens were chosen."""
+        seen = self._observe(tensordict)
+        chooser = self.chooser(tensordict)
+        with running_in(self.precision, seen.recent.device):
+            decision = self._memory.step(seen, chooser)
+        self._last = decision.token
+        return decision, chooser
+
+    def chooser(self, tensordict: TensorDictBase) -> Chooser:
+        """What chooses the tokens of the decision at hand."""
+        step = tensordict[keys.STEP][:, 0]
+        uniform = self._noise_there[torch.arange(len(step), device=step.device), step]
+        if exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE):
+            return Likeliest(uniform)
+        return Draw(uniform, self.decoding)
 
     def set_seed(self, seed: int) -> None:
         """Seed the sampling anew: the rollouts that begin from now on are the first ones of this seed."""
         self.seed = seed
         self._begun: dict[tuple[int, int], int] = {}
+
+    def _observe(self, tensordict: TensorDictBase) -> Observation:
+        step = tensordict[keys.STEP][:, 0]
+        at = step.tolist()  # all that is read back from the device in a decision
+        self._start(tensordict, at)
+        self._due = [each + 1 for each in at]
+        last = torch.where((step[:, None] > 0) & tensordict[keys.CONTROLLED], self._last, self.model.no_token)
+        return Observation(tensordict[keys.RECENT], last, step, max(at), tensordict[keys.KIND], tensordict[keys.VALID])
 
     # --- the start of episodes --------------------------------------------------------------------------------------
     def _start(self, tensordict: TensorDictBase, at: list[int]) -> None:
@@ -177,14 +250,3 @@ class MotionActor(TensorDictModuleBase):
             scene_id = self.contexts.scene_id(scene[row])
             self._noise[row, :, :agents] = rollout_noise(self.seed, scene_id, rollout, episode, (horizon, agents))
         self._noise_there = self._noise.to(self._last.device, non_blocking=True)
-
-    # --- sampling ---------------------------------------------------------------------------------------------------
-    def _sample(self, logits: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
-        """Tokens ``[B, A]`` and the log-probabilities by which they were drawn."""
-        if exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE):
-            token = logits.argmax(-1)
-            return token, torch.zeros_like(logits[..., 0])
-        log_probs = self.decoding.log_probs(logits)
-        uniform = self._noise_there[torch.arange(len(step), device=step.device), step]
-        token = draw(log_probs, uniform)
-        return token, log_probs.gather(-1, token[..., None])[..., 0]

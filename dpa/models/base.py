@@ -32,6 +32,30 @@ class Observation(NamedTuple):
     valid: Tensor
 
 
+class Choose(Protocol):
+    """Chooses tokens where a policy says how likely each is; whoever drives a policy gives it."""
+
+    def __call__(self, logits: Tensor, agents: Tensor | None = None) -> Tensor:
+        """``[B, n]`` tokens of some agents.
+
+        Args:
+            logits: ``[B, n, V]``.
+            agents: ``[B, n]`` which agents; all of them by default.
+        """
+
+
+class Decision(NamedTuple):
+    """What was chosen at a decision.
+
+    Attributes:
+        token: ``[B, A]``.
+        logits: ``[B, A, V]`` of the distributions that the tokens were chosen from.
+    """
+
+    token: Tensor
+    logits: Tensor
+
+
 class Memory(Protocol):
     """Running rollouts of some scenes: what a policy keeps of them between two decisions."""
 
@@ -44,8 +68,11 @@ class Memory(Protocol):
             anew: all rollouts do; otherwise some go on where they are, of scenes that are what they were.
         """
 
-    def step(self, seen: Observation) -> Tensor:
-        """``[B, A, V]`` logits of the decision at hand; equal to those of teacher forcing up to rounding (1e-5)."""
+    def step(self, seen: Observation, choose: Choose) -> Decision:
+        """Take the decision at hand: all agents at once, or one after another, who then know what those before chose.
+
+        The logits are those of teacher forcing up to rounding (1e-5).
+        """
 
 
 class MotionModel(nn.Module, ABC):

@@ -6,12 +6,66 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from dpa.models.actor import MotionActor
+from dpa.models.actor import MotionActor, of_agents
 from dpa.models.base import MotionModel
 from dpa.models.context import Contexts
+from dpa.tokens.base import MotionTokenizer
 from envs import keys
 from envs.geometry.boxes import box_corners
 from envs.geometry.frames import beside, to_local
+
+
+class Follow:
+    """Chooses among the K most probable tokens the one that ends nearest to a target.
+
+    Args:
+        tokenizer: what a token means.
+        candidates: K.
+        target: ``[B, A, F, 3]`` where to be, in the agents' own frames.
+        logged: ``[B, A]`` bool, there is a target; elsewhere the most probable token is taken.
+        recent: ``[B, A, F + 1, 3]``.
+        kind: ``[B, A]``.
+        size: ``[B, A, 2]`` length and width [m].
+
+    Attributes:
+        label: ``[B, A]`` the token of all that is best.
+        log_prob: 0, since nothing is drawn.
+    """
+
+    def __init__(
+        self,
+        tokenizer: MotionTokenizer,
+        candidates: int,
+        target: Tensor,
+        logged: Tensor,
+        recent: Tensor,
+        kind: Tensor,
+        size: Tensor,
+    ) -> None:
+        self.tokenizer, self.candidates = tokenizer, candidates
+        self.target, self.logged, self.recent, self.kind, self.size = target, logged, recent, kind, size
+        self.label = tokenizer.encode(target, recent, kind)
+        self.log_prob = torch.zeros_like(recent[:, :, 0, 0])
+
+    def __call__(self, logits: Tensor, agents: Tensor | None = None) -> Tensor:
+        """See :class:`~dpa.models.actor.Chooser`."""
+        likely = logits.topk(self.candidates).indices
+        best = likely == of_agents(self.label, agents)[..., None]
+        apart = self._apart(likely, agents).masked_fill(best, -1.0)
+        chosen = torch.where(of_agents(self.logged, agents), apart.argmin(-1), 0)
+        return likely.gather(-1, chosen[..., None])[..., 0]
+
+    def _apart(self, tokens: Tensor, agents: Tensor | None) -> Tensor:
+        """``[B, n, K]``: mean distance of the box's corners at the ends of tokens from those at the target [m]."""
+        target, recent, kind, size = (
+            of_agents(value, agents)[:, :, None] for value in (self.target, self.recent, self.kind, self.size)
+        )
+        many = tokens.shape[-1]
+        ends = self.tokenizer.decode(tokens, recent.expand(-1, -1, many, -1, -1), kind.expand_as(tokens))[..., -1, :]
+        there, here = (
+            box_corners(torch.cat((pose, size.expand(*pose.shape[:-1], 2)), -1)) for pose in (target[..., -1, :], ends)
+        )
+        return (here - there).norm(dim=-1).mean(-1)
 
 
 class ClosestActor(MotionActor):
@@ -69,21 +123,18 @@ class ClosestActor(MotionActor):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write a token and a label for every agent."""
-        logits = self.logits(tensordict).float()
+        super().forward(tensordict)
+        tensordict[keys.LABEL] = self._following.label
+        tensordict[keys.LABEL_VALID] = self._following.logged & tensordict[keys.CONTROLLED]
+        return tensordict
+
+    def chooser(self, tensordict: TensorDictBase) -> Follow:
+        """Chooses what ends nearest to the target."""
         recent, kind = tensordict[keys.RECENT], tensordict[keys.KIND]
         target, logged = self._target(tensordict[keys.STEP][:, 0], recent)
-        label = self.model.tokenizer.encode(target, recent, kind)
-        likely = logits.topk(self.candidates).indices
-        apart = self._apart(likely, target, recent, kind).masked_fill(likely == label[..., None], -1.0)
-        chosen = torch.where(logged, apart.argmin(-1), 0)
-        token = likely.gather(-1, chosen[..., None])[..., 0]
-        self._last = token
-        tensordict[keys.TOKEN] = token
-        tensordict[keys.LOG_PROB] = logits.log_softmax(-1).gather(-1, token[..., None])[..., 0]
-        tensordict[keys.SAMPLING_LOG_PROB] = torch.zeros_like(tensordict[keys.LOG_PROB])
-        tensordict[keys.LABEL] = label
-        tensordict[keys.LABEL_VALID] = logged & tensordict[keys.CONTROLLED]
-        return tensordict
+        size = self._context.episode.extent[..., :2].repeat_interleave(self.num_rollouts, 0)
+        self._following = Follow(self.model.tokenizer, self.candidates, target, logged, recent, kind, size)
+        return self._following
 
     def _target(self, step: Tensor, recent: Tensor) -> tuple[Tensor, Tensor]:
         """``[B, A, F, 3]``: where to be, in the agents' own frames; ``[B, A]``: the log knows the decision's end."""
@@ -98,15 +149,3 @@ class ClosestActor(MotionActor):
         left = (1 - self.recovery) * (valid[rows, :, before, -1] & (step > 0)[:, None])[..., None]
         target = beside(poses, current, logged[rows, :, before, -1], left)
         return to_local(target, current[..., None, :]), valid[rows, :, step, -1]
-
-    def _apart(self, tokens: Tensor, target: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
-        """``[B, A, K]``: mean distance of the box's corners at the ends of tokens from those at the target [m]."""
-        size = self._context.episode.extent[..., None, :2].repeat_interleave(self.num_rollouts, 0)
-        many = tokens.shape[-1]
-        ends = self.model.tokenizer.decode(
-            tokens, recent[:, :, None].expand(-1, -1, many, -1, -1), kind[..., None].expand_as(tokens)
-        )[..., -1, :]
-        there, here = (
-            box_corners(torch.cat((pose, size.expand(*pose.shape[:-1], 2)), -1)) for pose in (target[..., -1:, :], ends)
-        )
-        return (here - there).norm(dim=-1).mean(-1)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
-from dpa.models.base import Observation
+from dpa.models.base import Choose, Decision, Observation
 from dpa.models.motionlm.context import SceneContext
 from dpa.models.motionlm.decoder import NodeCache, NodeInputs, SceneMemory
 
@@ -40,9 +39,10 @@ class RolloutMemory:
             self._cache.clear()
         self._scenes = self.model.encode(context)
 
-    def step(self, seen: Observation) -> Tensor:
+    def step(self, seen: Observation, choose: Choose) -> Decision:
         """See :meth:`dpa.models.base.Memory.step`."""
         masks = self._cache.start(seen.step, seen.latest, seen.valid)
         when = seen.step[:, None].expand_as(seen.token)
         nodes = NodeInputs(seen.recent, seen.token, when, seen.kind, seen.valid)
-        return self._decode(nodes, self._scenes, masks, self._cache)
+        logits = self._decode(nodes, self._scenes, masks, self._cache).float()
+        return Decision(choose(logits), logits)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from dpa.models.base import Memory, MotionModel, Observation, named_size
+from dpa.models.base import Choose, Decision, Memory, MotionModel, Observation, named_size
 from dpa.models.context import Featurize
 from dpa.models.forcing import shown_by
 from dpa.models.neighbours import gather, nearest, rows_of
@@ -305,11 +305,12 @@ class SmartMemory:
             )
         return past
 
-    def step(self, seen: Observation) -> Tensor:
+    def step(self, seen: Observation, choose: Choose) -> Decision:
         """See :meth:`dpa.models.base.Memory.step`."""
         before = self._logged.map(partial(starting, seen.step == 0), self._past)
         x, self._past = self._advance(before, seen, self._extent)
-        return self.model.head(self.model.norm(x))
+        logits = self.model.head(self.model.norm(x)).float()
+        return Decision(choose(logits), logits)
 
     def _advance(self, past: Past, seen: Observation, extent: Tensor) -> tuple[Tensor, Past]:
         """``[B, A, width]`` after all layers, and the past with this decision."""

@@ -152,7 +152,8 @@ def test_a_decision_of_running_rollouts_stays_on_the_device(
                 torch.empty(*shape, 6, 3, device=DEVICE), torch.empty(shape, **whole), torch.empty(6, **whole), 1,
                 torch.empty(shape, **whole), torch.empty(shape, dtype=torch.bool, device=DEVICE),
             )  # fmt: skip
-            assert memory.step(seen).device.type == DEVICE
+            decision = memory.step(seen, lambda logits, agents=None: logits.argmax(-1))
+            assert decision.logits.device.type == decision.token.device.type == DEVICE
 
 
 if __name__ == "__main__":

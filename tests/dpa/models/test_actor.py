@@ -173,7 +173,7 @@ def test_rollouts_of_one_scene_differ(model: MotionLM, scenes: list[Scene]) -> N
 def test_the_deterministic_choice_is_the_most_probable_token(model: MotionLM, scenes: list[Scene]) -> None:
     env, actor = drive(model, scenes)
     state = env.reset()
-    logits = drive(model, scenes)[1].logits(state)
+    logits = drive(model, scenes)[1].decide(state)[0].logits
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         assert torch.equal(actor(state)[keys.TOKEN], logits.argmax(-1))
 
@@ -182,7 +182,7 @@ def test_sampling_log_probs_are_those_of_the_cut_distribution(model: MotionLM, s
     decoding = Decoding(top_p=0.6, temperature=0.8, top_k=20)
     env, actor = drive(model, scenes, decoding=decoding)
     state = env.reset()
-    logits = drive(model, scenes)[1].logits(state)
+    logits = drive(model, scenes)[1].decide(state)[0].logits
     out = actor(state)
     expected = decoding.log_probs(logits).gather(-1, out[keys.TOKEN][..., None])[..., 0]
     torch.testing.assert_close(out[keys.SAMPLING_LOG_PROB], expected)
@@ -245,7 +245,7 @@ def test_a_scene_is_encoded_once_for_all_its_rollouts_and_decisions(model: Motio
 def test_a_tiny_nucleus_is_the_most_probable_token(model: MotionLM, scenes: list[Scene]) -> None:
     env, actor = drive(model, scenes, decoding=Decoding(top_p=1e-6))
     state = env.reset()
-    logits = drive(model, scenes)[1].logits(state)
+    logits = drive(model, scenes)[1].decide(state)[0].logits
     assert torch.equal(actor(state)[keys.TOKEN], logits.argmax(-1))
 
 
@@ -255,7 +255,9 @@ def test_bfloat16_changes_the_distribution_by_little(model: MotionLM, scenes: li
     env, exact = drive(model, scenes)
     rounded = drive(model, scenes, precision="bfloat16")[1]
     state = env.reset()
-    before, after = (actor.logits(state).float()[state[keys.CONTROLLED]].log_softmax(-1) for actor in (exact, rounded))
+    before, after = (
+        actor.decide(state)[0].logits.float()[state[keys.CONTROLLED]].log_softmax(-1) for actor in (exact, rounded)
+    )
     assert not torch.equal(before, after)
     assert (before.exp() * (before - after)).sum(-1).abs().max() < 1e-3
 

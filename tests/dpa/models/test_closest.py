@@ -75,7 +75,7 @@ def test_the_label_is_taken_where_it_is_likely_and_otherwise_the_likely_token_th
         scene = straight_road(3, seed=seed)
         rolled, context = followed([scene], candidates=candidates), make_context(scene, featurize)
         env = TransformedEnv(TrafficEnv([scene]), TokenAction(TOKENIZER))
-        logits = ClosestActor(policy(), Contexts([scene], featurize)).logits(env.reset())
+        logits = ClosestActor(policy(), Contexts([scene], featurize)).decide(env.reset())[0].logits
         likely = logits.topk(candidates).indices[0]
         for agent in range(3):
             token, label = (rolled[key][0, 0, agent] for key in (keys.TOKEN, keys.LABEL))

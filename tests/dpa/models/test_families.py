@@ -163,9 +163,9 @@ def test_rows_that_begin_again_have_no_past(family: str, scene: Callable) -> Non
             state = env.step(actor(state))["next"].exclude("reward")
         rows = torch.tensor([True, False, False, False])[:, None]
         again = env.reset(state.set("_reset", rows))
-        logits = actor.logits(again.clone())
+        logits = actor.decide(again.clone())[0].logits
         fresh = MotionActor(model, Contexts(scenes, model.featurize, episode), num_rollouts=2)
-        expected = fresh.logits(env.reset())
+        expected = fresh.decide(env.reset())[0].logits
     torch.testing.assert_close(logits[0, :3], expected[0, :3], atol=1e-5, rtol=0)
 
 
