@@ -43,7 +43,7 @@ CONTROLLED: NestedKey = (AGENTS, "controlled")
 ACTION: NestedKey = (AGENTS, "action")
 """``[B, A, F, 3]``: the next F poses, in the agent's own current frame."""
 TOKEN: NestedKey = (AGENTS, "token")
-"""``[B, A]`` int64: the motion token that an action came from."""
+"""``[B, A, ...]``: the motion token that an action came from, int64, or the numbers of one without a vocabulary."""
 LOG_PROB: NestedKey = (AGENTS, "log_prob")
 """``[B, A]``: log-probability of the token under the whole model (temperature 1, nothing cut) [nats]."""
 SAMPLING_LOG_PROB: NestedKey = (AGENTS, "sampling_log_prob")
@@ -71,7 +71,7 @@ TRUNCATED: NestedKey = "truncated"
 
 # --- what ranking attaches to a group of K rollouts of one scene (batch size [S]) -----------------------------------
 TOKENS: NestedKey = "tokens"
-"""``[S, K, A, T]`` int64 (uint8 or int16 on disk): tokens of every rollout."""
+"""``[S, K, A, T, ...]`` (uint8 or int16 on disk where they are indices): tokens of every rollout."""
 TOKEN_VALID: NestedKey = "token_valid"
 """``[S, A, T]`` bool: controlled agents whose tokens count."""
 DISTANCE: NestedKey = "distance"
@@ -95,7 +95,7 @@ REWARDS = "rewards"
 
 # --- what a loss reads ----------------------------------------------------------------------------------------------
 LABELS: NestedKey = "labels"
-"""``[S, M, A, T]`` int64: tokens to predict, those of ``tokens`` or, after noise, those that lead back to the log."""
+"""``[S, M, A, T, ...]``: tokens to predict, those of ``tokens`` or, after noise, those that lead back to the log."""
 ADVANTAGE: NestedKey = "advantage"
 """``[S, K, A, T]``: how much better a rollout, or an agent's part of it, was than the others of its group."""
 SAMPLE_LOG_PROB: NestedKey = "sample_log_prob"
@@ -103,8 +103,8 @@ SAMPLE_LOG_PROB: NestedKey = "sample_log_prob"
 LEARNT: NestedKey = "learnt"
 """``[S, M or 1, A, T]`` bool: labels that count, where these are others than the tokens that count."""
 PREFERRED: NestedKey = "preferred"
-"""``[S, M, A, T]`` int64: tokens of the preferred rollouts."""
+"""``[S, M, A, T, ...]``: tokens of the preferred rollouts."""
 UNPREFERRED: NestedKey = "unpreferred"
-"""``[S, N, A, T]`` int64: tokens of the unpreferred rollouts; pair by pair where rollouts come in pairs (N = M)."""
+"""``[S, N, A, T, ...]``: tokens of the unpreferred rollouts; pair by pair where rollouts come in pairs (N = M)."""
 AGENT_PREFERENCE: NestedKey = "agent_preference"
 """``[S, M, A]`` int64: 1 where an agent itself prefers the preferred rollout of a pair, -1 the other, 0: no say."""

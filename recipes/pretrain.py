@@ -272,9 +272,9 @@ def negative_log_likelihood(
         batch = collate_items([item]).to(device)
         tokens, valid = batch["tokens"], batch["token_valid"]
         logits = model(batch["context"], tokens, valid)
-        nll = -logits.log_softmax(-1).gather(-1, tokens[..., None])[..., 0].cpu()
+        nll = -model.distribution.log_prob(logits, tokens).cpu()
         valid, tokens = valid.cpu(), tokens.cpu()
-        changes = ((tokens != tokens[..., :1]) & valid).any(-1, keepdim=True)
+        changes = (~model.tokenizer.alike(tokens, tokens[:, :, :, :1]) & valid).any(-1, keepdim=True)
         for row, mask in enumerate((valid, valid & changes)):
             totals[row] += torch.tensor([nll[mask].sum(), mask.sum()], dtype=torch.float64)
     model.train()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from tensordict import TensorDict
 from torch import Tensor
 
-from dpa.losses.network import masked_mean, reference_logits, token_divergence
+from dpa.losses.network import distribution_of, masked_mean, reference_logits
 from dpa.losses.next_token import NextTokenLoss
 from envs import keys
 
@@ -51,5 +51,5 @@ class ImitationLoss(NextTokenLoss):
     out_keys = ["loss_next_token", "accuracy", "entropy", "kl"]
 
     def _diagnostics(self, batch: TensorDict, logits: Tensor) -> dict[str, Tensor]:
-        drift = token_divergence(logits, reference_logits(self, batch))
+        drift = distribution_of(self.actor_network).divergence(logits, reference_logits(self, batch))
         return {"kl": masked_mean(drift, batch[keys.TOKEN_VALID])}

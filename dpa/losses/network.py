@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModule, TensorDictParams
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
+from dpa.models.distribution import TOKENS, Distribution
 from dpa.models.precision import Precision, check_precision, running_in
 from envs import keys
 
@@ -35,7 +36,8 @@ def token_network(model: nn.Module, precision: Precision = "float32") -> TensorD
 
     Args:
         model: called with a context of batch size ``[S]``, tokens ``[S, M, A, T]`` and their validity
-            ``[S, M or 1, A, T]``; gives logits ``[S, M, A, T, V]`` (:class:`~dpa.models.MotionModel` does).
+            ``[S, M or 1, A, T]``; gives logits ``[S, M, A, T, V]`` (:class:`~dpa.models.MotionModel` does). A
+            ``distribution`` of its own says what they mean; without one they are logits of tokens.
         precision: of its linear layers; weights, gradients and logits are float32 all the same.
 
     Returns:
@@ -46,7 +48,13 @@ def token_network(model: nn.Module, precision: Precision = "float32") -> TensorD
     """
     rounded = model if check_precision(precision) == "float32" else _Rounded(model, precision)
     network = TensorDictModule(rounded, in_keys=[CONTEXT, keys.TOKENS, keys.TOKEN_VALID], out_keys=[LOGITS])
+    network.distribution = getattr(model, "distribution", TOKENS)
     return network.train(model.training)
+
+
+def distribution_of(network: TensorDictModule) -> Distribution:
+    """What the logits of a network mean."""
+    return getattr(network, "distribution", TOKENS)
 
 
 def hold_network(loss: LossModule, network: TensorDictModule, *, keep_reference: bool) -> None:
@@ -65,7 +73,7 @@ def network_input(context: TensorDictBase, tokens: Tensor, token_valid: Tensor) 
 
 
 def logits_under(parameters: TensorDictParams, network: TensorDictModule, batch: TensorDictBase) -> Tensor:
-    """Logits ``[S, M, A, T, V]`` of a network under some parameters of its kind; the batch stays as it is."""
+    """Logits ``[S, M, A, T, P]`` of a network under some parameters of its kind; the batch stays as it is."""
     with parameters.to_module(network):
         return network(batch.copy())[LOGITS]
 
@@ -121,20 +129,3 @@ def scene_mean(value: Tensor, mask: Tensor) -> Tensor:
     mask = mask.expand_as(value)
     within = tuple(range(1, value.ndim))
     return (value.where(mask, value.new_zeros(())).sum(within) / mask.sum(within).clamp(min=1)).mean()
-
-
-def token_log_prob(logits: Tensor, tokens: Tensor) -> Tensor:
-    """Log-probability of each token [nats]: ``[..., V]`` and ``[...]`` to ``[...]``."""
-    return logits.log_softmax(-1).gather(-1, tokens[..., None])[..., 0]
-
-
-def token_entropy(logits: Tensor) -> Tensor:
-    """Entropy of each token's distribution [nats]: ``[..., V]`` to ``[...]``."""
-    log_probs = logits.log_softmax(-1)
-    return -(log_probs.exp() * log_probs).sum(-1)
-
-
-def token_divergence(logits: Tensor, reference: Tensor) -> Tensor:
-    """KL(pi || pi_ref) of each token's distribution [nats]: twice ``[..., V]`` to ``[...]``."""
-    log_probs = logits.log_softmax(-1)
-    return (log_probs.exp() * (log_probs - reference.log_softmax(-1))).sum(-1)

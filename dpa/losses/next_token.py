@@ -9,10 +9,9 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictParams, dispatch
 from torch import Tensor
-from torch.nn.functional import cross_entropy
 from torchrl.objectives import LossModule
 
-from dpa.losses.network import CONTEXT, hold_network, logits_under, masked_mean, network_input, token_entropy
+from dpa.losses.network import CONTEXT, distribution_of, hold_network, logits_under, masked_mean, network_input
 from envs import keys
 
 
@@ -57,8 +56,8 @@ class NextTokenLoss(LossModule):
 
         Attributes:
             context: :class:`~dpa.models.context.Context` of batch size ``[S]``.
-            tokens: ``[S, M, A, T]`` int64, what the network reads.
-            labels: ``[S, M, A, T]`` int64, what it is to predict; the tokens themselves by default.
+            tokens: ``[S, M, A, T, ...]``, what the network reads.
+            labels: ``[S, M, A, T, ...]``, what it is to predict; the tokens themselves by default.
             token_valid: ``[S, M or 1, A, T]`` bool; an agent is seen by others while its tokens are valid.
             learnt: ``[S, M or 1, A, T]`` bool, labels that count; by default those of valid tokens.
         """
@@ -105,14 +104,11 @@ class NextTokenLoss(LossModule):
         batch = network_input(tensordict[accepted.context], tokens, valid)
         logits = logits_under(self.actor_network_params, self.actor_network, batch)
         labels = tensordict[accepted.labels]
-        each = cross_entropy(
-            logits.flatten(0, -2), labels.flatten(), reduction="none", label_smoothing=self.label_smoothing
-        )
-        learnt = tensordict[accepted.learnt]
-        loss = masked_mean(each.view_as(labels), learnt)
+        learnt, says = tensordict[accepted.learnt], distribution_of(self.actor_network)
+        loss = masked_mean(says.surprise(logits, labels, self.label_smoothing), learnt)
         with torch.no_grad():
-            hit = (logits.argmax(-1) == labels).to(logits.dtype)
-            entropy = masked_mean(token_entropy(logits), learnt)
+            hit = says.hit(logits, labels).to(logits.dtype)
+            entropy = masked_mean(says.entropy(logits), learnt)
             diagnostics = {"accuracy": masked_mean(hit, learnt), "entropy": entropy}
             diagnostics |= self._diagnostics(batch, logits)
         return TensorDict({"loss_next_token": loss, **diagnostics}, batch_size=[])

@@ -12,14 +12,12 @@ from torchrl.objectives import LossModule
 
 from dpa.losses.network import (
     CONTEXT,
+    distribution_of,
     hold_network,
     logits_under,
     masked_mean,
     network_input,
     reference_logits,
-    token_divergence,
-    token_entropy,
-    token_log_prob,
 )
 from dpa.losses.preference import check_not_negative, check_positive
 from envs import keys
@@ -82,7 +80,7 @@ class PolicyGradientLoss(LossModule):
 
         Attributes:
             context: :class:`~dpa.models.context.Context` of batch size ``[S]``.
-            tokens: ``[S, K, A, T]`` int64.
+            tokens: ``[S, K, A, T, ...]``.
             token_valid: ``[S, 1, A, T]`` bool.
             advantage: broadcastable to ``[S, K, A, T]``.
             sample_log_prob: ``[S, K, A, T]`` when the tokens were drawn, read by a clipped loss alone.
@@ -132,12 +130,13 @@ class PolicyGradientLoss(LossModule):
         tokens, valid = tensordict[accepted.tokens], tensordict[accepted.token_valid]
         batch = network_input(tensordict[accepted.context], tokens, valid)
         logits = logits_under(self.actor_network_params, self.actor_network, batch)
-        log_prob = token_log_prob(logits, tokens)
+        says = distribution_of(self.actor_network)
+        log_prob = says.log_prob(logits, tokens)
         gain, diagnostics = self._gain(log_prob, tensordict)
         with torch.set_grad_enabled(self.kl > 0 and torch.is_grad_enabled()):
-            drift = masked_mean(token_divergence(logits, reference_logits(self, batch)), valid)
+            drift = masked_mean(says.divergence(logits, reference_logits(self, batch)), valid)
         with torch.set_grad_enabled(self.entropy > 0 and torch.is_grad_enabled()):
-            entropy = masked_mean(token_entropy(logits), valid)
+            entropy = masked_mean(says.entropy(logits), valid)
         diagnostics |= {"kl": drift, "entropy": entropy, "nll": masked_mean(-log_prob, valid)}
         out = {
             "loss_objective": -masked_mean(gain, valid),

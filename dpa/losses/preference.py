@@ -14,14 +14,12 @@ from torchrl.objectives import LossModule
 
 from dpa.losses.network import (
     CONTEXT,
+    distribution_of,
     hold_network,
     logits_under,
     network_input,
     reference_logits,
     scene_mean,
-    token_divergence,
-    token_entropy,
-    token_log_prob,
 )
 from envs import keys
 
@@ -113,7 +111,7 @@ class PreferenceLoss(LossModule):
     ``pair_accuracy``     share of pairs whose preferred rollout is the more likely one
     ``nll_preferred``     negative log-likelihood per token [nats]; ``nll_unpreferred`` likewise
     ``entropy``           of the policy, per token [nats]
-    ``kl``                of the policy from the reference, per token, over the vocabulary [nats]
+    ``kl``                of the policy from the reference, per token, whatever was drawn [nats]
     ===================== ============================================================================================
 
     Every one is a mean over scenes, so a step is the same however its scenes are split into parts or among ranks.
@@ -151,8 +149,8 @@ class PreferenceLoss(LossModule):
 
         Attributes:
             context: :class:`~dpa.models.context.Context` of batch size ``[S]``.
-            preferred: ``[S, M, A, T]`` int64.
-            unpreferred: ``[S, N, A, T]`` int64.
+            preferred: ``[S, M, A, T, ...]``.
+            unpreferred: ``[S, N, A, T, ...]``.
             token_valid: ``[S, 1, A, T]`` bool, the same for both sides.
         """
 
@@ -228,11 +226,11 @@ class PreferenceLoss(LossModule):
         valid = tensordict[accepted.token_valid]
         batch = network_input(tensordict[accepted.context], tokens, valid)
         logits = logits_under(self.actor_network_params, self.actor_network, batch)
-        reference = reference_logits(self, batch)
+        reference, says = reference_logits(self, batch), distribution_of(self.actor_network)
         with torch.no_grad():
-            drift = token_divergence(logits, reference)
-        log_prob = token_log_prob(logits, tokens)
-        gain = log_prob - token_log_prob(reference, tokens) if self.reference else log_prob
+            drift = says.divergence(logits, reference)
+        log_prob = says.log_prob(logits, tokens)
+        gain = log_prob - says.log_prob(reference, tokens) if self.reference else log_prob
 
         sides = zip(gain.split(sizes, 1), drift.split(sizes, 1), strict=True)
         compared = self.compare(*(Side(*side, valid, self.alpha, self.score_reduction) for side in sides), tensordict)
@@ -242,7 +240,7 @@ class PreferenceLoss(LossModule):
         with torch.no_grad():
             out |= _weighing(compared)
             out |= {"pair_accuracy": self._pair_accuracy(*likelihoods, valid), "nll_preferred": nll.detach()}
-            out |= {"nll_unpreferred": nll_unpreferred.detach(), "entropy": scene_mean(token_entropy(logits), valid)}
+            out |= {"nll_unpreferred": nll_unpreferred.detach(), "entropy": scene_mean(says.entropy(logits), valid)}
             out |= {"kl": scene_mean(drift, valid)}
         return TensorDict(out, batch_size=[])
 

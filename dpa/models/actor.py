@@ -13,8 +13,9 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from dpa.models.base import Decision, MotionModel, Observation
 from dpa.models.context import Context, Contexts, collate_contexts, pad_context
+from dpa.models.distribution import Distribution
 from dpa.models.precision import Precision, check_precision, running_in
-from dpa.models.sampling import Decoding, draw, rollout_noise
+from dpa.models.sampling import Decoding, rollout_noise
 from envs import keys
 
 
@@ -35,18 +36,18 @@ class Draw:
     """Draws from a distribution made from that of the model.
 
     Args:
-        uniform: ``[B, A]`` numbers in [0, 1) that decide.
-        decoding: the distribution.
+        distribution: of the model.
+        uniform: ``[B, A, numbers]`` in [0, 1), that decide.
+        decoding: how the distribution is changed.
     """
 
-    def __init__(self, uniform: Tensor, decoding: Decoding) -> None:
-        self.uniform, self.decoding, self.log_prob = uniform, decoding, torch.zeros_like(uniform)
+    def __init__(self, distribution: Distribution, uniform: Tensor, decoding: Decoding) -> None:
+        self.distribution, self.uniform, self.decoding = distribution, uniform, decoding
+        self.log_prob = torch.zeros_like(uniform[..., 0])
 
     def __call__(self, logits: Tensor, agents: Tensor | None = None) -> Tensor:
         """See :class:`Chooser`."""
-        log_probs = self.decoding.log_probs(logits)
-        token = draw(log_probs, of_agents(self.uniform, agents))
-        by = log_probs.gather(-1, token[..., None])[..., 0]
+        token, by = self.distribution.draw(logits, of_agents(self.uniform, agents), self.decoding)
         self.log_prob = by if agents is None else self.log_prob.scatter(1, agents, by)
         return token
 
@@ -55,15 +56,16 @@ class Likeliest:
     """Takes the most probable token.
 
     Args:
+        distribution: of the model.
         like: ``[B, A]``, gives shape and device.
     """
 
-    def __init__(self, like: Tensor) -> None:
-        self.log_prob = torch.zeros_like(like)
+    def __init__(self, distribution: Distribution, like: Tensor) -> None:
+        self.distribution, self.log_prob = distribution, torch.zeros_like(like)
 
     def __call__(self, logits: Tensor, agents: Tensor | None = None) -> Tensor:
         """See :class:`Chooser`."""
-        return logits.argmax(-1)
+        return self.distribution.likeliest(logits)
 
 
 def of_agents(value: Tensor, agents: Tensor | None) -> Tensor:
@@ -143,7 +145,7 @@ class MotionActor(TensorDictModuleBase):
         self.decoding, self.precision = decoding or Decoding(top_p=1.0), check_precision(precision)
         self._memory = model.remember(compile=compile)
         self._due: list[int] = []  # the decision that each row takes next
-        self._last: Tensor | None = None  # [B, A], tokens of the decision before
+        self._last: Tensor | None = None  # [B, A, ...], tokens of the decision before
         self.set_seed(seed)
 
     @torch.no_grad()
@@ -151,7 +153,7 @@ class MotionActor(TensorDictModuleBase):
         """Write a token for every agent and its log-probabilities."""
         (token, logits), chooser = self.decide(tensordict)
         tensordict[keys.TOKEN] = token
-        tensordict[keys.LOG_PROB] = logits.log_softmax(-1).gather(-1, token[..., None])[..., 0]
+        tensordict[keys.LOG_PROB] = self.model.distribution.log_prob(logits, token)
         tensordict[keys.SAMPLING_LOG_PROB] = chooser.log_prob
         return tensordict
 
@@ -169,8 +171,8 @@ class MotionActor(TensorDictModuleBase):
         step = tensordict[keys.STEP][:, 0]
         uniform = self._noise_there[torch.arange(len(step), device=step.device), step]
         if exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE):
-            return Likeliest(uniform)
-        return Draw(uniform, self.decoding)
+            return Likeliest(self.model.distribution, uniform[..., 0])
+        return Draw(self.model.distribution, uniform, self.decoding)
 
     def set_seed(self, seed: int) -> None:
         """Seed the sampling anew: the rollouts that begin from now on are the first ones of this seed."""
@@ -182,7 +184,8 @@ class MotionActor(TensorDictModuleBase):
         at = step.tolist()  # all that is read back from the device in a decision
         self._start(tensordict, at)
         self._due = [each + 1 for each in at]
-        last = torch.where((step[:, None] > 0) & tensordict[keys.CONTROLLED], self._last, self.model.no_token)
+        acted = self.model.tokenizer.of_numbers((step[:, None] > 0) & tensordict[keys.CONTROLLED])
+        last = torch.where(acted, self._last, self.model.no_token)
         return Observation(tensordict[keys.RECENT], last, step, max(at), tensordict[keys.KIND], tensordict[keys.VALID])
 
     # --- the start of episodes --------------------------------------------------------------------------------------
@@ -197,10 +200,12 @@ class MotionActor(TensorDictModuleBase):
         if 0 not in at:
             return
         scene, begins = tensordict[keys.SCENE].tolist(), [row for row, each in enumerate(at) if each == 0]
-        anew = self._last is None or self._last.shape != shape or len(begins) == len(at)
+        anew = self._last is None or self._last.shape[:2] != shape or len(begins) == len(at)
         if anew:
-            self._last = torch.full(shape, self.model.no_token, device=step.device)
-            self._noise = torch.zeros(shape[0], self.model.config.horizon, shape[1])
+            tokenizer, numbers = self.model.tokenizer, self.model.distribution.numbers
+            whole = (*shape, *tokenizer.shape)
+            self._last = torch.full(whole, self.model.no_token, dtype=tokenizer.dtype, device=step.device)
+            self._noise = torch.zeros(shape[0], self.model.config.horizon, shape[1], numbers)
             begins = list(range(len(at)))
             self._scenes = scene[:: self.num_rollouts]
         # Padding depends on the scenes of a batch, so a change of some encodes all: rare, and cheap beside the episode.
@@ -240,13 +245,13 @@ class MotionActor(TensorDictModuleBase):
             self._begun[named] = self._begun.get(named, 0) + 1
 
     def _draw_noise(self, rows: list[int], scene: list[int]) -> None:
-        horizon, beside = self.model.config.horizon, Counter()
+        horizon, numbers, beside = self.model.config.horizon, self.model.distribution.numbers, Counter()
         for row in rows:
             rollout = self.first_rollout + row % self.num_rollouts
             named = (scene[row], rollout)
             episode = self._begun.get(named, 0) + beside[named]
             beside[named] += 1  # groups of one batch may show the same scene
             agents = len(self.contexts[scene[row]].episode.kind)
-            scene_id = self.contexts.scene_id(scene[row])
-            self._noise[row, :, :agents] = rollout_noise(self.seed, scene_id, rollout, episode, (horizon, agents))
+            scene_id, drawn = self.contexts.scene_id(scene[row]), (horizon, agents, numbers)
+            self._noise[row, :, :agents] = rollout_noise(self.seed, scene_id, rollout, episode, drawn)
         self._noise_there = self._noise.to(self._last.device, non_blocking=True)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 from torch import Tensor, nn
 
 from dpa.models.context import Context, Featurize
+from dpa.models.distribution import TOKENS, Distribution
 from dpa.tokens.base import MotionTokenizer
 
 
@@ -17,7 +18,7 @@ class Observation(NamedTuple):
 
     Attributes:
         recent: ``[B, A, F + 1, 3]`` poses of the last decision.
-        token: ``[B, A]`` token of it; V where there is none.
+        token: ``[B, A, ...]`` token of it; V where there is none.
         step: ``[B]`` index of the decision.
         latest: the largest of these, known without asking the device.
         kind: ``[B, A]`` :class:`~envs.scene.AgentKind`.
@@ -36,10 +37,10 @@ class Choose(Protocol):
     """Chooses tokens where a policy says how likely each is; whoever drives a policy gives it."""
 
     def __call__(self, logits: Tensor, agents: Tensor | None = None) -> Tensor:
-        """``[B, n]`` tokens of some agents.
+        """``[B, n, ...]`` tokens of some agents.
 
         Args:
-            logits: ``[B, n, V]``.
+            logits: ``[B, n, P]``.
             agents: ``[B, n]`` which agents; all of them by default.
         """
 
@@ -48,8 +49,8 @@ class Decision(NamedTuple):
     """What was chosen at a decision.
 
     Attributes:
-        token: ``[B, A]``.
-        logits: ``[B, A, V]`` of the distributions that the tokens were chosen from.
+        token: ``[B, A, ...]``.
+        logits: ``[B, A, P]`` of the distributions that the tokens were chosen from.
     """
 
     token: Tensor
@@ -83,14 +84,16 @@ class MotionModel(nn.Module, ABC):
     Attributes:
         tokenizer: what an action is.
         config: size of the model, a dataclass with ``horizon``.
+        distribution: what the logits mean.
     """
 
     tokenizer: MotionTokenizer
     config: Any
+    distribution: Distribution = TOKENS
 
     @property
     def no_token(self) -> int:
-        """Stands for the last token of an agent that has none: V."""
+        """Stands for the last token, or each of its numbers, of an agent that has none: V."""
         return self.tokenizer.vocab_size
 
     @property
@@ -104,11 +107,11 @@ class MotionModel(nn.Module, ABC):
 
         Args:
             context: of batch size ``[S]``.
-            tokens: ``[S, M, A, T]`` int64.
+            tokens: ``[S, M, A, T, ...]``.
             token_valid: ``[S, M or 1, A, T]`` bool; a controlled agent is seen by others while its tokens are valid.
 
         Returns:
-            ``[S, M, A, T, V]`` logits; those of agents that are not controlled mean nothing.
+            ``[S, M, A, T, P]`` logits, P = V of tokens; those of agents that are not controlled mean nothing.
         """
 
     @abstractmethod

@@ -90,7 +90,7 @@ class ClosestActor(MotionActor):
         recovery: above 0, and 1 for the log itself, as in the paper.
 
     Raises:
-        ValueError: no such number of tokens, or no such share.
+        ValueError: no such number of tokens, or no such share; a policy without a vocabulary.
 
     Beside what a :class:`~dpa.models.MotionActor` writes stand ``label`` and ``label_valid`` of each agent. Nothing is
     drawn; ``sampling_log_prob`` is 0.
@@ -111,6 +111,8 @@ class ClosestActor(MotionActor):
 
     def __init__(self, model: MotionModel, contexts: Contexts, *, candidates: int = 32, recovery: float = 1.0) -> None:
         super().__init__(model, contexts)
+        if not model.distribution.discrete:
+            raise ValueError("CAT-K follows the log by a policy's own most probable tokens, and patches have none.")
         if not 1 <= candidates <= model.tokenizer.vocab_size:
             raise ValueError(
                 f"candidates must be 1 to {model.tokenizer.vocab_size}, the number of tokens, got {candidates}."

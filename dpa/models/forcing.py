@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from dpa.tokens.base import MotionTokenizer
 from envs.episode import Episode
@@ -17,7 +16,7 @@ class Shown(NamedTuple):
 
     Attributes:
         recent: ``[S, M, T, A, F + 1, 3]`` poses of the decision before.
-        token: ``[S, M, T, A]`` token of it; V where there is none.
+        token: ``[S, M, T, A, ...]`` token of it; V where there is none.
         valid: ``[S, M, T, A]`` bool, others may look at the agent.
     """
 
@@ -31,7 +30,7 @@ def shown_by(episode: Episode, tokens: Tensor, token_valid: Tensor, tokenizer: M
 
     Args:
         episode: of batch size ``[S]``.
-        tokens: ``[S, M, A, T]`` int64.
+        tokens: ``[S, M, A, T, ...]``.
         token_valid: ``[S, M or 1, A, T]`` bool.
         tokenizer: of the tokens.
 
@@ -43,9 +42,10 @@ def shown_by(episode: Episode, tokens: Tensor, token_valid: Tensor, tokenizer: M
         >>> shown_by(episode, tokens, torch.ones(1, 1, 2, 16, dtype=torch.bool), VerletTokenizer()).recent.shape
         torch.Size([1, 3, 16, 2, 6, 3])
     """
-    controlled = episode.controlled[:, None, :, None]
-    token = torch.where(controlled, F.pad(tokens[..., :-1], (1, 0), value=tokenizer.vocab_size), tokenizer.vocab_size)
-    valid = _validity(episode, token_valid.expand_as(tokens), tokenizer.steps)
+    controlled, none = tokenizer.of_numbers(episode.controlled[:, None, :, None]), tokenizer.vocab_size
+    before = torch.cat((torch.full_like(tokens[:, :, :, :1], none), tokens[:, :, :, :-1]), 3)
+    token = torch.where(controlled, before, none)
+    valid = _validity(episode, token_valid.expand(tokens.shape[:4]), tokenizer.steps)
     return Shown(_recent(episode, tokens, tokenizer), token.transpose(2, 3), valid.transpose(2, 3))
 
 
@@ -56,8 +56,8 @@ def _recent(episode: Episode, tokens: Tensor, tokenizer: MotionTokenizer) -> Ten
     def each(value: Tensor) -> Tensor:
         return value.repeat_interleave(tokens.shape[1], 0)
 
-    start, flat, steps = each(episode.recent), tokens.flatten(0, 1)[..., :-1], tokenizer.steps
-    moved = tokenizer.decode_tracks(flat, start, each(episode.kind)) if flat.shape[-1] else start[..., :0, :]
+    start, flat, steps = each(episode.recent), tokens.flatten(0, 1)[:, :, :-1], tokenizer.steps
+    moved = tokenizer.decode_tracks(flat, start, each(episode.kind)) if flat.shape[2] else start[..., :0, :]
     future = each(episode.logged)[..., : moved.shape[-2], :]
     track = torch.cat((start, torch.where(each(episode.controlled)[..., None, None], moved, future)), -2)
     return track.unfold(-2, steps + 1, steps).movedim(-1, -2).transpose(1, 2).unflatten(0, tokens.shape[:2])

@@ -6,8 +6,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
-from dpa.models import motionlm, smart
+from dpa.models import behaviorgpt, motionlm, smart
 from dpa.models.base import MotionModel
+from dpa.models.factorised import NeighbourhoodOptions
 from dpa.tokens.base import MotionTokenizer
 
 
@@ -27,7 +28,8 @@ class Family(NamedTuple):
 
 FAMILIES: dict[str, Family] = {
     "motionlm": Family(motionlm.MotionLM, motionlm.SIZES, motionlm.ContextOptions),
-    "smart": Family(smart.SMART, smart.SIZES, smart.SmartContextOptions),
+    "smart": Family(smart.SMART, smart.SIZES, NeighbourhoodOptions),
+    "behaviorgpt": Family(behaviorgpt.BehaviorGPT, behaviorgpt.SIZES, NeighbourhoodOptions),
 }
 """Families that a YAML can name; add one of your own here (docs/how-to.md)."""
 

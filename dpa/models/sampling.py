@@ -92,7 +92,7 @@ def draw(log_probs: Tensor, uniform: Tensor) -> Tensor:
     return torch.searchsorted(reached, place, right=True)[..., 0]
 
 
-def rollout_noise(seed: int, scene_id: str, rollout: int, episode: int, shape: tuple[int, int]) -> Tensor:
+def rollout_noise(seed: int, scene_id: str, rollout: int, episode: int, shape: tuple[int, ...]) -> Tensor:
     """The numbers in [0, 1) that decide the tokens of one rollout.
 
     They depend on what is named and on nothing else, so a rollout is the same whatever batch it is part of, and
@@ -103,13 +103,13 @@ def rollout_noise(seed: int, scene_id: str, rollout: int, episode: int, shape: t
         scene_id: of the scene.
         rollout: k, its number among the rollouts of the scene.
         episode: how often the rollout was begun before.
-        shape: ``(T, A)``.
+        shape: ``(T, A, numbers of a draw)``.
 
     Returns:
-        ``[T, A]``.
+        of that shape.
 
     Examples:
-        >>> rollout_noise(0, "a scene", rollout=3, episode=0, shape=(16, 2)).shape
-        torch.Size([16, 2])
+        >>> rollout_noise(0, "a scene", rollout=3, episode=0, shape=(16, 2, 1)).shape
+        torch.Size([16, 2, 1])
     """
     return torch.rand(shape, generator=make_generator(seed, "rollout", scene_id, rollout, episode))

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from dpa.preferences.codec import decode
-from dpa.preferences.group import Group
+from dpa.preferences.group import Group, group_shapes
 from dpa.preferences.provenance import FORMAT, Provenance, StoreError
 from envs.framing import Framing
 from envs.shards import check_shape
@@ -126,8 +126,10 @@ def read_group(path: Path, record: ChunkRecord, row: int, origin: Provenance) ->
     try:
         with path.open("rb") as file:
             file.seek(record.offsets[row])
-            group = decode(file.read(record.sizes[row]), origin.token_dtype)
-        wanted = (scene, (record.num_agents[row], origin.num_rollouts, origin.horizon), record.num_features)
+            group = decode(file.read(record.sizes[row]), origin.layout)
+        sizes = (record.num_agents[row], origin.num_rollouts, origin.horizon, record.num_features)
+        shapes = group_shapes(*sizes, origin.layout.shape)
+        wanted = (scene, shapes["tokens"], record.num_features)
         found = (group.scene, group.tokens.shape, group.feature_share.shape[-1])
         if found != wanted:
             raise StoreError(f"scene, shape of tokens and features are {found} where {wanted} were noted")

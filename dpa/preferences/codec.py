@@ -18,7 +18,7 @@ import numpy as np
 import zstandard
 
 from dpa.preferences.group import NUMBERS, Group, group_shapes
-from dpa.preferences.provenance import StoreError
+from dpa.preferences.provenance import SMALL, StoreError, TokenLayout
 
 LEVEL = 12
 """Of Zstandard: 1 ms for 64 rollouts of 32 agents, made in a second; unpacking costs the same at any level."""
@@ -29,12 +29,12 @@ _FLAGS = ("token_valid", "agent_ranked")
 _HEADER = struct.Struct("<q4I")
 
 
-def encode(group: Group, token_dtype: type[np.integer] = np.uint8) -> bytes:
+def encode(group: Group, layout: TokenLayout = SMALL) -> bytes:
     """Pack one group.
 
     Args:
         group: checked (:func:`~dpa.preferences.group.check_group`).
-        token_dtype: of the store's tokens.
+        layout: of the store's tokens.
 
     Raises:
         StoreError: it is larger than any that is read back.
@@ -46,14 +46,14 @@ def encode(group: Group, token_dtype: type[np.integer] = np.uint8) -> bytes:
         >>> bool((decode(encode(group)).tokens == group.tokens).all())
         True
     """
-    a, k, t = group.tokens.shape
+    a, k, t = group.tokens.shape[:3]
     planes = _planes(_joined(group, NUMBERS).astype("<f4"))
     alike = b"".join(
         (
             _HEADER.pack(group.scene, a, k, t, group.feature_share.shape[-1]),
             np.packbits(_joined(group, _FLAGS)).tobytes(),
             group.agent_kind.astype(np.uint8).tobytes(),
-            _planes(group.tokens.astype(np.dtype(token_dtype).newbyteorder("<"))).tobytes(),
+            _planes(group.tokens.astype(np.dtype(layout.dtype).newbyteorder("<"))).tobytes(),
             planes[3].tobytes(),
         )
     )
@@ -68,12 +68,12 @@ def encode(group: Group, token_dtype: type[np.integer] = np.uint8) -> bytes:
     return first + packer.compress(noise) + packer.flush()
 
 
-def decode(block: bytes, token_dtype: type[np.integer] = np.uint8) -> Group:
+def decode(block: bytes, layout: TokenLayout = SMALL) -> Group:
     """Unpack one group; its arrays are new and may be changed.
 
     Args:
         block: from :func:`encode`.
-        token_dtype: of the store's tokens.
+        layout: of the store's tokens.
 
     Raises:
         StoreError: the bytes are damaged.
@@ -82,15 +82,15 @@ def decode(block: bytes, token_dtype: type[np.integer] = np.uint8) -> Group:
     if len(data) < _HEADER.size:
         raise StoreError("its block is shorter than a header")
     scene, a, k, t, d = _HEADER.unpack_from(data)
-    shapes, token = group_shapes(a, k, t, d), np.dtype(token_dtype).newbyteorder("<")
+    shapes, token = group_shapes(a, k, t, d, layout.shape), np.dtype(layout.dtype).newbyteorder("<")
     flags, numbers = (sum(math.prod(shapes[name]) for name in names) for names in (_FLAGS, NUMBERS))
-    sizes = (_HEADER.size, -(-flags // 8), a, a * k * t * token.itemsize, 4 * numbers)
+    sizes = (_HEADER.size, -(-flags // 8), a, math.prod(shapes["tokens"]) * token.itemsize, 4 * numbers)
     if sum(sizes) != len(data):
         raise StoreError(f"its block has {len(data)} bytes where the header asks for {sum(sizes)}")
     _, bits, kind, tokens, planes = np.split(data, np.cumsum(sizes)[:-1])
     planes = np.roll(planes.reshape(4, numbers), -1, axis=0)
     arrays = {
-        "tokens": _values(tokens.reshape(token.itemsize, -1), token).astype(token_dtype),
+        "tokens": _values(tokens.reshape(token.itemsize, -1), token).astype(layout.dtype),
         "agent_kind": kind.copy(),
     }
     arrays |= _parted(np.unpackbits(bits, count=flags).astype(bool), _FLAGS, shapes)

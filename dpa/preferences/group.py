@@ -23,7 +23,7 @@ class Group(NamedTuple):
 
     scene: int
     tokens: np.ndarray
-    """``[A, K, T]`` whole numbers; 0 where no token counts."""
+    """``[A, K, T]`` whole numbers, or ``[A, K, T, D]`` float32; 0 where no token counts."""
     token_valid: np.ndarray
     """``[A, T]`` bool."""
     agent_ranked: np.ndarray
@@ -40,10 +40,10 @@ class Group(NamedTuple):
     """``[K, D]`` float32."""
 
 
-def group_shapes(a: int, k: int, t: int, d: int) -> dict[str, tuple[int, ...]]:
-    """Shape of every array of a :class:`Group` of A agents, K rollouts, T decisions and D features."""
+def group_shapes(a: int, k: int, t: int, d: int, token: tuple[int, ...] = ()) -> dict[str, tuple[int, ...]]:
+    """Shape of every array of a :class:`Group` of A agents, K rollouts, T decisions and D features, and of a token."""
     return {
-        "tokens": (a, k, t),
+        "tokens": (a, k, t, *token),
         "token_valid": (a, t),
         "agent_ranked": (a,),
         "agent_kind": (a,),
@@ -63,10 +63,10 @@ def take_groups(groups: TensorDictBase, origin: Provenance) -> list[Group]:
         StoreError: groups that are not of this origin, or a value that cannot be right.
     """
     tokens = groups[keys.TOKENS]
-    if tokens.shape[1] != origin.num_rollouts or tokens.shape[-1] != origin.horizon:
+    if tokens.shape[1] != origin.num_rollouts or tokens.shape[3] != origin.horizon:
         raise StoreError(
             f"this store is for {origin.num_rollouts} rollouts of {origin.horizon} decisions, got {tokens.shape[1]} of "
-            f"{tokens.shape[-1]}; name a new folder, or roll out like the groups that it holds."
+            f"{tokens.shape[3]}; name a new folder, or roll out like the groups that it holds."
         )
     taken = [_taken(group) for group in groups.cpu()]
     for group in taken:
@@ -78,7 +78,8 @@ def _taken(group: TensorDictBase) -> Group:
     valid, ranked, kind = group[keys.TOKEN_VALID], group[keys.AGENT_RANKED], group[keys.AGENT_KIND]
     there = (valid.any(-1) | ranked | (kind != AgentKind.UNSET)).nonzero()
     size = int(there.max()) + 1 if len(there) else 0
-    tokens = torch.where(valid, group[keys.TOKENS], 0)
+    tokens = group[keys.TOKENS]
+    tokens = torch.where(valid.view(*valid.shape, *(1,) * (tokens.dim() - 3)), tokens, 0)
     return Group(
         scene=int(group[keys.SCENE]),
         tokens=tokens.transpose(0, 1)[:size].contiguous().numpy(),
@@ -102,22 +103,23 @@ def check_group(group: Group, origin: Provenance) -> None:
     Raises:
         StoreError: naming the scene and what is wrong with it.
     """
-    name, valid = f"scene {group.scene}", np.broadcast_to(group.token_valid[:, None], group.tokens.shape)
+    name, valid = f"scene {group.scene}", np.broadcast_to(group.token_valid[:, None], group.tokens.shape[:3])
     used = group.tokens[valid]
     if group.scene < 0:
         raise StoreError(f"{name}: the index of a scene is not negative; give the index in the scene source.")
-    shapes = group_shapes(len(group.tokens), origin.num_rollouts, origin.horizon, group.feature_share.shape[-1])
+    shapes = group_shapes(len(group.tokens), origin.num_rollouts, origin.horizon, group.feature_share.shape[-1],
+                          origin.layout.shape)  # fmt: skip
     for field, shape in shapes.items():
         if getattr(group, field).shape != shape:
             raise StoreError(f"{name}: {field} is {getattr(group, field).shape} and not {shape}; rank it again.")
-    if used.size and not 0 <= used.min() <= used.max() < origin.vocab_size:
+    if origin.vocab_size and used.size and not 0 <= used.min() <= used.max() < origin.vocab_size:
         raise StoreError(
             f"{name}: tokens from {used.min()} to {used.max()} are outside the vocabulary of {origin.vocab_size}; "
             "give the vocab_size of the tokenizer."
         )
     if group.tokens[~valid].any():
         raise StoreError(f"{name}: there are tokens where none counts; roll it out and rank it again.")
-    for field in NUMBERS:
+    for field in ("tokens", *NUMBERS):
         if not np.isfinite(getattr(group, field)).all():
             raise StoreError(f"{name}: {field} is not finite everywhere; rank it again.")
     if group.agent_distance[~group.agent_ranked].any():
@@ -135,8 +137,9 @@ def pad_groups(groups: Sequence[Group], origin: Provenance, num_features: int, n
         num_features: D.
         num_agents: A, at least that of the largest group.
     """
-    shapes = group_shapes(num_agents, origin.num_rollouts, origin.horizon, num_features)
-    made = {name: torch.zeros(len(groups), *shape, dtype=_DTYPES.get(name)) for name, shape in shapes.items()}
+    shapes = group_shapes(num_agents, origin.num_rollouts, origin.horizon, num_features, origin.layout.shape)
+    dtypes = _DTYPES | {"tokens": torch.int64 if origin.vocab_size else torch.float32}
+    made = {name: torch.zeros(len(groups), *shape, dtype=dtypes.get(name)) for name, shape in shapes.items()}
     for row, group in enumerate(groups):
         for name, values in made.items():
             array = torch.from_numpy(getattr(group, name))
@@ -158,4 +161,4 @@ def pad_groups(groups: Sequence[Group], origin: Provenance, num_features: int, n
     )
 
 
-_DTYPES = {"tokens": torch.int64, "agent_kind": torch.int64, "token_valid": torch.bool, "agent_ranked": torch.bool}
+_DTYPES = {"agent_kind": torch.int64, "token_valid": torch.bool, "agent_ranked": torch.bool}

@@ -6,7 +6,7 @@ import hashlib
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,6 +36,22 @@ class StoreError(ValueError):
     """A preference store cannot be used as asked; the message names it and says the fix."""
 
 
+class TokenLayout(NamedTuple):
+    """How tokens lie in a store.
+
+    Attributes:
+        dtype: of a token, or of its numbers.
+        shape: of one token, ``()`` for an index.
+    """
+
+    dtype: type[np.number] = np.uint8
+    shape: tuple[int, ...] = ()
+
+
+SMALL = TokenLayout()
+"""Of indices below 256."""
+
+
 @dataclass(frozen=True)
 class Provenance:
     """What the groups of a store came from; two runs may share a store only if all of it agrees.
@@ -48,7 +64,7 @@ class Provenance:
         seed: of the rollouts.
         num_rollouts: K.
         horizon: T.
-        vocab_size: V.
+        vocab_size: V; 0 where tokens are patches of poses.
         tokenizer: options that decide what a token means.
     """
 
@@ -74,9 +90,11 @@ class Provenance:
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
     @property
-    def token_dtype(self) -> type[np.integer]:
-        """The smallest integer that holds a token."""
-        return np.uint8 if self.vocab_size <= 256 else np.int16
+    def layout(self) -> TokenLayout:
+        """The smallest integer that holds a token; three numbers for each step of a patch."""
+        if not self.vocab_size:
+            return TokenLayout(np.float32, (3 * self.tokenizer["steps"],))
+        return TokenLayout(np.uint8 if self.vocab_size <= 256 else np.int16)
 
     def to_json(self) -> str:
         """The text of the metadata file."""

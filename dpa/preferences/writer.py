@@ -61,7 +61,7 @@ class PreferenceWriter:
     def __init__(self, folder: str | Path, provenance: Provenance, chunk_scenes: int = 64) -> None:
         if chunk_scenes < 1:
             raise ValueError(f"chunk_scenes must be 1 or more, got {chunk_scenes}.")
-        if not 1 <= provenance.vocab_size <= np.iinfo(np.int16).max + 1:
+        if not 0 <= provenance.vocab_size <= np.iinfo(np.int16).max + 1:
             raise ValueError(f"a vocabulary of {provenance.vocab_size} tokens does not fit the 16 bits of a store.")
         self.folder, self.provenance, self.chunk_scenes = Path(folder), provenance, chunk_scenes
         self._waiting: dict[int, PackedGroup] = {}
@@ -103,7 +103,7 @@ class PreferenceWriter:
                     group.scene,
                     len(group.tokens),
                     group.feature_share.shape[-1],
-                    encode(group, self.provenance.token_dtype),
+                    encode(group, self.provenance.layout),
                 )
         self._waiting |= new
         while len(self._waiting) >= self.chunk_scenes:

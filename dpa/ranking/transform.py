@@ -91,8 +91,8 @@ class RankRollouts(Transform):
             {
                 keys.SCENE: scene,
                 keys.TOKENS: tokens,
-                keys.TOKEN_VALID: controlled[:, :, None].expand(-1, -1, tokens.shape[-1]).clone(),
-                **self.entries(ranked, controlled.shape[1], tokens.shape[-1]),
+                keys.TOKEN_VALID: controlled[:, :, None].expand(-1, -1, tokens.shape[3]).clone(),
+                **self.entries(ranked, controlled.shape[1], tokens.shape[3]),
             },
             batch_size=[len(ranked)],
             device=tensordict.device,
@@ -120,11 +120,11 @@ class RankRollouts(Transform):
         }
 
     def _groups(self, rollouts: TensorDictBase) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Scene ``[S]``, controlled ``[S, A]``, tokens ``[S, K, A, T]`` and poses ``[S, K, A, T * F, 3]``."""
+        """Scene ``[S]``, controlled ``[S, A]``, tokens ``[S, K, A, T, ...]`` and poses ``[S, K, A, T * F, 3]``."""
         rollouts = self._check_episodes(rollouts)
         scene = self._alike(rollouts[keys.SCENE], "scenes")
         controlled = self._alike(rollouts[keys.CONTROLLED], "controlled agents")
-        tokens = rollouts[keys.TOKEN].movedim(2, -1)
+        tokens = rollouts[keys.TOKEN].transpose(2, 3)
         decisions = rollouts["next", *keys.RECENT][..., 1:, :]  # the first pose repeats the last one of the step before
         return scene, controlled, tokens, decisions.movedim(2, 3).flatten(3, 4)
 

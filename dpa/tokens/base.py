@@ -16,10 +16,10 @@ class TokenizedTracks(NamedTuple):
     """Tracks as tokens.
 
     Attributes:
-        tokens: ``[*, A, T]`` int64.
+        tokens: ``[*, A, T, ...]``.
         valid: ``[*, A, T]`` bool, the token was encoded from logged poses; false from the first hole of a log on.
         poses: ``[*, A, T * F, 3]``, what the tokens decode to, in the scene's frame.
-        labels: ``[*, A, T]`` int64, the token that comes nearest to the log from where the tokens before have led; it
+        labels: ``[*, A, T, ...]``, the token that comes nearest to the log from where the tokens before have led; it
             differs from ``tokens`` where noise has replaced it.
     """
 
@@ -32,17 +32,27 @@ class TokenizedTracks(NamedTuple):
 class MotionTokenizer(nn.Module):
     """Maps one token to the F next poses of an agent, and back.
 
+    A token is an index into a vocabulary, or, where there is none, a few numbers: then every tensor of tokens has them
+    in dimensions of its own after those of agents and decisions.
+
     A tokenizer has no memory: what it needs of the past it reads from ``recent``, the poses of the last decision. A
     subclass gives ``vocab_size``, ``steps`` (F), :meth:`encode`, :meth:`decode` and :meth:`neighbour`; tables and bin
     sizes are buffers.
 
     Attributes:
-        vocab_size: V.
+        vocab_size: V; 0 where there is no vocabulary.
         steps: F, poses of 0.1 s in one token.
+        shape: of one token, ``()`` for an index.
     """
 
     vocab_size: int
     steps: int
+    shape: tuple[int, ...] = ()
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of tokens."""
+        return torch.int64 if self.vocab_size else torch.float32
 
     @classmethod
     def settled(cls, **options: Any) -> dict[str, Any]:
@@ -62,7 +72,7 @@ class MotionTokenizer(nn.Module):
             kind: ``[*]`` :class:`~envs.scene.AgentKind`.
 
         Returns:
-            ``[*]`` int64.
+            ``[*, ...]``.
         """
 
     @abstractmethod
@@ -71,10 +81,10 @@ class MotionTokenizer(nn.Module):
 
     @abstractmethod
     def neighbour(self, token: Tensor, kind: Tensor, drawn: Tensor) -> Tensor:
-        """A random token of nearly the same motion as each token ``[*]``, for noisy tokenization.
+        """A random token of nearly the same motion as each token ``[*, ...]``, for noisy tokenization.
 
         Args:
-            token: ``[*]`` int64.
+            token: ``[*, ...]``.
             kind: ``[*]`` or what broadcasts to it.
             drawn: ``[*, 2]`` uniform in [0, 1): what decides which neighbour.
         """
@@ -122,16 +132,26 @@ class MotionTokenizer(nn.Module):
             tokens.append(self._noisy(labels[-1], kind, noise, drawn[..., step, :]) if noise else labels[-1])
             recent = self.advance(tokens[-1], recent, kind)
             tracks.append(recent[..., 1:, :])
-        return TokenizedTracks(torch.stack(tokens, -1), token_valid, torch.cat(tracks, -2), torch.stack(labels, -1))
+        together = (torch.stack(each, kind.dim()) for each in (tokens, labels))
+        return TokenizedTracks(next(together), token_valid, torch.cat(tracks, -2), next(together))
+
+    def alike(self, one: Tensor, other: Tensor) -> Tensor:
+        """``[*]`` bool: tokens ``[*, ...]`` that mean the same motion."""
+        return one == other
 
     def _noisy(self, token: Tensor, kind: Tensor, noise: float, drawn: Tensor) -> Tensor:
-        return torch.where(drawn[..., 0] < noise, self.neighbour(token, kind, drawn[..., 1:]), token)
+        replaced = self.of_numbers(drawn[..., 0] < noise)
+        return torch.where(replaced, self.neighbour(token, kind, drawn[..., 1:]), token)
+
+    def of_numbers(self, mask: Tensor) -> Tensor:
+        """A mask of tokens ``[*]`` as one of their numbers, ``[*, ...]``."""
+        return mask.view(*mask.shape, *(1 for _ in self.shape))
 
     def decode_tracks(self, tokens: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
         """Poses of a row of tokens.
 
         Args:
-            tokens: ``[*, A, T]`` int64.
+            tokens: ``[*, A, T, ...]``.
             recent: ``[*, A, F + 1, 3]``.
             kind: ``[*, A]``.
 
@@ -139,7 +159,7 @@ class MotionTokenizer(nn.Module):
             ``[*, A, T * F, 3]`` in the frame of ``recent``.
         """
         tracks = []
-        for token in tokens.unbind(-1):
+        for token in tokens.unbind(kind.dim()):
             recent = self.advance(token, recent, kind)
             tracks.append(recent[..., 1:, :])
         return torch.cat(tracks, -2)
@@ -152,3 +172,18 @@ class MotionTokenizer(nn.Module):
         """``recent`` after one token: ``[*, F + 1, 3]``."""
         current = recent[..., -1:, :]
         return torch.cat((current, to_world(self.decode(token, recent, kind), current)), -2)
+
+
+def check_vocabulary(tokenizer: MotionTokenizer, who: str) -> MotionTokenizer:
+    """Refuse a tokenizer without a vocabulary.
+
+    Args:
+        tokenizer: to check.
+        who: wants one, for the message.
+
+    Raises:
+        ValueError: it has none.
+    """
+    if not tokenizer.vocab_size:
+        raise ValueError(f"{who} predicts tokens of a vocabulary, and patches have none; name another model.tokenizer.")
+    return tokenizer

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Categorical, Composite
+from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import Transform
 
 from dpa.tokens.base import MotionTokenizer
@@ -43,6 +43,8 @@ class TokenAction(Transform):
 
     def _check(self, token: Tensor) -> None:
         """Refuse a token outside the vocabulary, which would be decoded to a motion that none has."""
+        if not self.tokenizer.vocab_size:
+            return
         inside = ((token >= 0) & (token < self.tokenizer.vocab_size)).all()
         if token.device.type != "cpu":  # where it is told without waiting for the device
             torch._assert_async(inside, f"tokens must be 0 to {self.tokenizer.vocab_size - 1}.")
@@ -61,7 +63,9 @@ class TokenAction(Transform):
                 f"{self.tokenizer.steps}; say EpisodeOptions(decision_steps={self.tokenizer.steps})."
             )
         del action[keys.ACTION]
-        action[keys.TOKEN] = Categorical(
-            self.tokenizer.vocab_size, shape=poses.shape[:-2], device=poses.device, dtype=torch.int64
-        )
+        shape, device = poses.shape[:-2], poses.device
+        if self.tokenizer.vocab_size:
+            action[keys.TOKEN] = Categorical(self.tokenizer.vocab_size, shape=shape, device=device, dtype=torch.int64)
+        else:
+            action[keys.TOKEN] = Unbounded((*shape, *self.tokenizer.shape), device=device)
         return input_spec

@@ -21,9 +21,9 @@ class Item(NamedTuple):
 
     Attributes:
         context: uncollated.
-        tokens: ``[M, A, T]`` int64.
+        tokens: ``[M, A, T, ...]``.
         token_valid: ``[A, T]`` bool.
-        labels: ``[M, A, T]`` int64, what to predict where it is not the tokens themselves (noisy tokenization).
+        labels: ``[M, A, T, ...]``, what to predict where it is not the tokens themselves (noisy tokenization).
     """
 
     context: Context
@@ -33,22 +33,22 @@ class Item(NamedTuple):
 
 
 def collate_items(items: Sequence[Item]) -> TensorDict:
-    """A batch for a loss: ``context``, ``tokens`` and ``labels`` ``[S, M, A, T]`` and ``token_valid`` ``[S, 1, A, T]``.
+    """A batch for a loss: ``context``, ``tokens``, ``labels`` ``[S, M, A, T, ...]``, ``token_valid`` ``[S, 1, A, T]``.
 
     Args:
         items: S items of equal M and T.
     """
     agents = max(item.tokens.shape[1] for item in items)
 
-    def pad(value: Tensor) -> Tensor:
-        return F.pad(value, (0, 0, 0, agents - value.shape[-2]))
+    def pad(value: Tensor, dim: int = 1) -> Tensor:
+        return F.pad(value, (0, 0) * (value.dim() - 1 - dim) + (0, agents - value.shape[dim]))
 
     return TensorDict(
         {
             "context": collate_contexts([item.context for item in items]),
             keys.TOKENS: torch.stack([pad(item.tokens) for item in items]),
             keys.LABELS: torch.stack([pad(item.tokens if item.labels is None else item.labels) for item in items]),
-            keys.TOKEN_VALID: torch.stack([pad(item.token_valid) for item in items])[:, None],
+            keys.TOKEN_VALID: torch.stack([pad(item.token_valid, 0) for item in items])[:, None],
         },
         batch_size=[len(items)],
     )

@@ -37,8 +37,8 @@ class Group(NamedTuple):
 
     Attributes:
         context: uncollated.
-        preferred: ``[M, A, T]`` tokens.
-        unpreferred: ``[N, A, T]`` tokens; None for a method that only imitates.
+        preferred: ``[M, A, T, ...]`` tokens.
+        unpreferred: ``[N, A, T, ...]`` tokens; None for a method that only imitates.
         token_valid: ``[A, T]`` bool, the same for both sides, so that nothing but the motion tells them apart.
         agent_preference: ``[M, A]`` int64 of pairs, see :func:`~dpa.preferences.agent_preference`; None where agents
             have no distance of their own.
@@ -149,7 +149,7 @@ class Candidates(Sequence[Group]):
         group = group_of(self.data, context, self.store.read([row], num_agents=agents)[0], self.chosen[row])
         if self.data.kind == "adversarial":
             log = log_item(context, self.tokenizer)
-            return _against(group, log.tokens.expand(self.data.num, -1, -1), log.token_valid)
+            return _against(group, log.tokens.expand(self.data.num, *log.tokens.shape[1:]), log.token_valid)
         if self.data.kind == "expert":
             played = self.expert.read([_row_of(self.expert, scene)], num_agents=agents)[0]
             draw = make_generator(self.seed, "expert_rollouts", scene)

@@ -9,7 +9,6 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from dpa.losses.network import token_divergence, token_entropy, token_log_prob
 from dpa.models import Contexts, Decoding, MotionModel, collate_contexts
 from dpa.models.context import Context
 from dpa.preferences import PreferenceStore, nearest_farthest
@@ -33,10 +32,10 @@ class Probe(NamedTuple):
 
     Attributes:
         context: uncollated.
-        demonstration: ``[A, T]`` tokens of the log.
+        demonstration: ``[A, T, ...]`` tokens of the log.
         demonstration_valid: ``[A, T]`` bool.
-        preferred: ``[M, A, T]`` tokens of the rollouts nearest to the log.
-        unpreferred: ``[M, A, T]`` tokens of the farthest ones.
+        preferred: ``[M, A, T, ...]`` tokens of the rollouts nearest to the log.
+        unpreferred: ``[M, A, T, ...]`` tokens of the farthest ones.
         valid: ``[A, T]`` bool, of the rollouts.
     """
 
@@ -112,20 +111,20 @@ def probe_sides(model: MotionModel, probes: Iterable[Probe], device: str = "cpu"
     found = []
     for each in probes:
         context, tokens, valid = _rollouts(each, device)
-        now = _log_prob(model(context, tokens, valid), tokens, valid)
+        now = _log_prob(model, model(context, tokens, valid), tokens, valid)
         found.append({name: value.item() for name, value in _sides(now, valid).items()})
     return found
 
 
 def _rollouts(each: Probe, device: str) -> tuple[Context, Tensor, Tensor]:
-    """Context, tokens ``[1, 2 * M, A, T]`` and validity ``[1, 1, A, T]``, the preferred rollouts first."""
+    """Context, tokens ``[1, 2 * M, A, T, ...]`` and validity ``[1, 1, A, T]``, the preferred rollouts first."""
     tokens = torch.cat((each.preferred, each.unpreferred))[None]
     return collate_contexts([each.context]).to(device), tokens.to(device), each.valid[None, None].to(device)
 
 
-def _log_prob(logits: Tensor, tokens: Tensor, valid: Tensor) -> Tensor:
+def _log_prob(model: MotionModel, logits: Tensor, tokens: Tensor, valid: Tensor) -> Tensor:
     """``[2 * M]``, of whole rollouts."""
-    return (token_log_prob(logits, tokens)[0] * valid[0]).sum((-1, -2))
+    return (model.distribution.log_prob(logits, tokens)[0] * valid[0]).sum((-1, -2))
 
 
 def _sides(now: Tensor, valid: Tensor) -> dict[str, Tensor]:
@@ -146,15 +145,15 @@ def _share_above(near: Tensor, far: Tensor, valid: Tensor, tie: float = 0.0) -> 
 def _probed(model: MotionModel, reference: MotionModel, each: Probe, device: str) -> dict[str, float]:
     context, tokens, valid = _rollouts(each, device)
     logits, before = (policy(context, tokens, valid) for policy in (model, reference))
-    now, then = (_log_prob(seen, tokens, valid) for seen in (logits, before))
+    now, then = (_log_prob(model, seen, tokens, valid) for seen in (logits, before))
     near_gain, far_gain = (now - then).chunk(2)
     log_tokens, log_valid = (value[None, None].to(device) for value in (each.demonstration, each.demonstration_valid))
-    log = token_log_prob(model(context, log_tokens, log_valid), log_tokens)
+    log = model.distribution.log_prob(model(context, log_tokens, log_valid), log_tokens)
     found = _sides(now, valid) | {
         "reward_accuracy": _share_above(near_gain, far_gain, valid, tie=0.5),
         "nll_demonstration": -log[log_valid].mean(),
-        "entropy": _mean(token_entropy(logits), valid),
-        "kl": _mean(token_divergence(logits, before), valid),
+        "entropy": _mean(model.distribution.entropy(logits), valid),
+        "kl": _mean(model.distribution.divergence(logits, before), valid),
     }
     return {name: value.item() for name, value in found.items()}
 
@@ -206,9 +205,9 @@ def divergence(
 
 
 def _groups(batches: Iterable[TensorDictBase], num_rollouts: int) -> Iterator[tuple[int, Tensor, Tensor]]:
-    """Scene, tokens ``[K, A, T]`` and controlled ``[A]`` of every group of a collector's batches ``[S * K, T]``."""
+    """Scene, tokens ``[K, A, T, ...]``, controlled ``[A]`` of every group of a collector's batches ``[S * K, T]``."""
     for batch in batches:
-        tokens = batch[keys.TOKEN].movedim(1, -1)
+        tokens = batch[keys.TOKEN].transpose(1, 2)
         for first in range(0, len(batch), num_rollouts):
             group = slice(first, first + num_rollouts)
             yield int(batch[keys.SCENE][first, 0]), tokens[group], batch[keys.CONTROLLED][first, 0]
@@ -218,6 +217,7 @@ def _groups(batches: Iterable[TensorDictBase], num_rollouts: int) -> Iterator[tu
 def _kl(model: MotionModel, reference: MotionModel, context: Context, tokens: Tensor, controlled: Tensor) -> float:
     num_agents = len(context.episode.kind)
     tokens, controlled = tokens[None, :, :num_agents], controlled[:num_agents]
-    valid = controlled[None, None, :, None].expand(1, 1, -1, tokens.shape[-1])
+    valid = controlled[None, None, :, None].expand(1, 1, -1, tokens.shape[3])
     context = collate_contexts([context]).to(tokens.device)
-    return _mean(token_divergence(*(policy(context, tokens, valid) for policy in (model, reference))), valid).item()
+    seen = (policy(context, tokens, valid) for policy in (model, reference))
+    return _mean(model.distribution.divergence(*seen), valid).item()

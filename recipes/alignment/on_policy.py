@@ -32,7 +32,7 @@ from recipes.alignment.data import check_data, check_rolling, rewards_of
 from recipes.alignment.draws import Draw, make_batch
 from recipes.common.cli import build
 
-OF_AGENTS = {keys.TOKENS: -2, keys.SAMPLE_LOG_PROB: -2, keys.TOKEN_VALID: -2, keys.AGENT_DISTANCE: -1,
+OF_AGENTS = {keys.TOKENS: 1, keys.SAMPLE_LOG_PROB: -2, keys.TOKEN_VALID: -2, keys.AGENT_DISTANCE: -1,
              keys.AGENT_RANKED: -1, keys.AGENT_KIND: -1, keys.SPREAD: -1}  # fmt: skip
 """Entries of a ranked group with one row for each agent, and the dimension of these rows."""
 

@@ -16,12 +16,16 @@ from omegaconf import DictConfig, OmegaConf
 from dpa import zoo
 from dpa.models import MotionModel
 from dpa.models.registry import FAMILIES, build_model, size_of
-from dpa.tokens import KDisksTokenizer, MotionTokenizer, VerletTokenizer
+from dpa.tokens import KDisksTokenizer, MotionTokenizer, PatchTokenizer, VerletTokenizer
 from dpa.training.checkpoint import CheckpointError, load_policy, load_weights, save_policy
 from envs.episode import EPISODE_STEPS, EpisodeOptions
 from recipes.common.cli import CONFIG, build, plain
 
-TOKENIZERS: dict[str, type[MotionTokenizer]] = {"verlet": VerletTokenizer, "k_disks": KDisksTokenizer}
+TOKENIZERS: dict[str, type[MotionTokenizer]] = {
+    "verlet": VerletTokenizer,
+    "k_disks": KDisksTokenizer,
+    "patches": PatchTokenizer,
+}
 """Tokenizers that a YAML can name; add a class of your own here (docs/how-to.md)."""
 
 

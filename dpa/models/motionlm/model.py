@@ -16,7 +16,7 @@ from dpa.models.motionlm.context import ContextOptions, SceneContext, featurize
 from dpa.models.motionlm.decoder import NEAREST_PIECES, MotionDecoder, NodeInputs, SceneMemory
 from dpa.models.motionlm.encoder import SceneEncoder
 from dpa.models.motionlm.memory import RolloutMemory
-from dpa.tokens.base import MotionTokenizer
+from dpa.tokens.base import MotionTokenizer, check_vocabulary
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class MotionLM(MotionModel):
         context: how scenes are cut up.
 
     Raises:
-        ValueError: a name that is no size.
+        ValueError: a name that is no size, or a tokenizer without a vocabulary.
 
     Examples:
         >>> from dpa.models.context import collate_contexts, make_context
@@ -76,7 +76,7 @@ class MotionLM(MotionModel):
         self, config: MotionLMConfig | str, tokenizer: MotionTokenizer, context: ContextOptions | None = None
     ) -> None:
         super().__init__()
-        config = named_size(config, SIZES)
+        config, tokenizer = named_size(config, SIZES), check_vocabulary(tokenizer, "MotionLM")
         self.config, self.tokenizer, self.context = config, tokenizer, context or ContextOptions()
         size = (config.width, config.heads, config.feed)
         self.encoder = SceneEncoder(*size, config.encoder_layers, config.dropout)

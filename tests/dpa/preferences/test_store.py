@@ -22,6 +22,7 @@ from dpa.preferences.chunk import PackedGroup, chunk_content, chunk_name, read_r
 from dpa.preferences.codec import decode, encode
 from dpa.preferences.examples import example_groups, example_provenance
 from dpa.preferences.group import NUMBERS, Group, group_shapes, take_groups
+from dpa.preferences.provenance import TokenLayout
 from dpa.ranking.distance import rank_of
 from envs import keys
 
@@ -118,7 +119,7 @@ def test_any_group_comes_back_to_the_last_bit(data, agents: int, rollouts: int, 
     whole = {"tokens": array("tokens", np.int16, 2047), "agent_kind": array("agent_kind", np.uint8, 4)}
     flags = {name: array(name, np.uint8, 1).astype(bool) for name in ("token_valid", "agent_ranked")}
     group = Group(data.draw(st.integers(0, 2**62)), **bits, **whole, **flags)
-    back = decode(encode(group, np.int16), np.int16)
+    back = decode(encode(group, TokenLayout(np.int16)), TokenLayout(np.int16))
     assert back.scene == group.scene
     for name in shapes:
         mine, theirs = getattr(back, name), getattr(group, name)

@@ -1,4 +1,4 @@
-"""What SMART sees of a scene: short map pieces, and its agents."""
+"""What a policy of neighbourhoods sees of a scene: short map pieces, and its agents."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ SLACK = 0.01
 
 
 @dataclass(frozen=True)
-class SmartContextOptions(PieceOptions):
-    """How a scene is cut up for SMART."""
+class NeighbourhoodOptions(PieceOptions):
+    """How a scene is cut up: into short pieces."""
 
     max_pieces: int = 768
     piece_length: float = 5.0
 
 
-class SmartContext(TensorClass["nocast"]):
-    """Inputs of SMART for one scene, or for a padded batch of them (``*`` is nothing or ``S``).
+class NeighbourhoodContext(TensorClass["nocast"]):
+    """Inputs of a policy for one scene, or for a padded batch of them (``*`` is nothing or ``S``).
 
     Attributes:
         episode: its agents.
@@ -47,7 +47,7 @@ class SmartContext(TensorClass["nocast"]):
     map_valid: Tensor
 
 
-def featurize(scene: Scene, episode: Episode, options: SmartContextOptions | None = None) -> SmartContext:
+def featurize(scene: Scene, episode: Episode, options: NeighbourhoodOptions | None = None) -> NeighbourhoodContext:
     """Cut up one uncollated scene.
 
     Examples:
@@ -57,9 +57,9 @@ def featurize(scene: Scene, episode: Episode, options: SmartContextOptions | Non
         >>> featurize(scene, make_episode(scene)).map_points.shape[1:]
         torch.Size([3, 2])
     """
-    options = options or SmartContextOptions()
+    options = options or NeighbourhoodOptions()
     pieces = cut_map(scene, episode.logged.shape[-2], options, PIECE_POINTS, SLACK)
-    return SmartContext(
+    return NeighbourhoodContext(
         episode=episode,
         **{f"map_{name}": value for name, value in pieces._asdict().items()},
         batch_size=[],

@@ -1,0 +1,200 @@
+"""A density of patches: a mixture of modes, each of Laplace and von Mises densities, frame by frame.
+
+A frame goes on from the two before it: a mode says by how much velocity and yaw rate change, and how surely. So noise
+is noise of accelerations, and what is drawn moves smoothly.
+
+A patch has the frames ``(x_t, y_t, h_t)``, t = 1 to F, in the agent's own frame. With the second differences
+``a_t = x_t - 2 x_{t-1} + x_{t-2}`` (of x, y and, wrapped, of h), where the frames 0 and -1 are the last two that were
+seen, the density is
+
+    ``p = sum_k pi_k prod_t Laplace(a_t^x; m, b) Laplace(a_t^y; m, b) VonMises(a_t^h; m, kappa)``
+
+with m, b and kappa of mode k and frame t. Second differences and poses map onto each other with determinant 1, so it is
+the density of the poses as well.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from dpa.models.distribution import Distribution
+from dpa.models.sampling import Decoding, draw
+from envs.geometry.frames import wrap_angle
+
+NEAR = 1.0
+"""The most probable patch hits another one that ends so near [m]."""
+LEAST_SCALE = 0.001
+"""Of a Laplace density [m]: agents that stand do not move at all, and a density must have an end."""
+CONCENTRATION = (4.0, 1e6)
+"""Least and largest concentration kappa of a von Mises density: a standard deviation of 0.5 rad and of 1 mrad."""
+SURE = 100.0
+"""Above this kappa a von Mises density is a normal one but for terms of higher order, which an expansion has."""
+CELLS = 128
+"""Of the table by which angles are drawn."""
+WIDTH = 8.0
+"""Half the width of the table, in standard deviations."""
+
+
+class Mixture(NamedTuple):
+    """What a row of numbers says.
+
+    Attributes:
+        modes: ``[*, K]`` log-probabilities.
+        mean: ``[*, K, F, 3]`` of the second differences [m, rad].
+        scale: ``[*, K, F, 2]`` of the Laplace densities [m].
+        kappa: ``[*, K, F]`` of the von Mises density.
+        before: ``[*, 3]`` change of the pose over the last step that was seen [m, rad].
+    """
+
+    modes: Tensor
+    mean: Tensor
+    scale: Tensor
+    kappa: Tensor
+    before: Tensor
+
+    @classmethod
+    def of(cls, logits: Tensor, frames: int) -> Mixture:
+        """Read ``[*, K + 6 * K * F + 3]`` numbers."""
+        modes = (logits.shape[-1] - 3) // (1 + 6 * frames)
+        weight, rest, before = logits.split((modes, modes * 6 * frames, 3), -1)
+        mean, spread, sure = rest.unflatten(-1, (modes, frames, 6)).split((3, 2, 1), -1)
+        least, most = CONCENTRATION
+        kappa = (sure[..., 0].clamp(max=math.log(most))).exp() + least
+        return cls(weight.log_softmax(-1), mean, softplus(spread) + LEAST_SCALE, kappa, before)
+
+    def warmer(self, decoding: Decoding) -> Mixture:
+        """That of a decoding: modes are cut, and with a temperature all densities are as much wider or narrower."""
+        modes, t = decoding.log_probs(self.modes), decoding.temperature
+        return self._replace(modes=modes, scale=self.scale * t, kappa=self.kappa / t**2)
+
+
+class PatchMixture(Distribution):
+    """Of patches of F poses, by K modes: P is ``K + 6 K F + 3``.
+
+    Entropy and divergence of a mixture have no closed form. Those here are of the mode and of the frames given the
+    mode: bounds from above, exact where modes do not overlap, and 0 where nothing differs.
+
+    A :class:`~dpa.models.Decoding` cuts modes, and its temperature scales the densities of a mode as well.
+
+    Args:
+        frames: F.
+
+    Examples:
+        >>> mixture = PatchMixture(frames=10)
+        >>> logits = torch.zeros(2, 4 * 61 + 3)  # four modes
+        >>> patch, by = mixture.draw(logits, torch.rand(2, mixture.numbers), Decoding(top_p=1.0))
+        >>> patch.shape, torch.allclose(by, mixture.log_prob(logits, patch), rtol=1e-3)
+        (torch.Size([2, 30]), True)
+    """
+
+    discrete = False
+
+    def __init__(self, frames: int) -> None:
+        self.frames, self.numbers = frames, 1 + 3 * frames
+
+    def log_prob(self, logits: Tensor, token: Tensor) -> Tensor:
+        """See :meth:`~dpa.models.distribution.Distribution.log_prob`; per metre and radian of each frame."""
+        return self._log_density(Mixture.of(logits, self.frames), token)
+
+    def entropy(self, logits: Tensor) -> Tensor:
+        """See :meth:`~dpa.models.distribution.Distribution.entropy`; a bound from above."""
+        said = Mixture.of(logits, self.frames)
+        laplace = (1 + math.log(2) + said.scale.log()).sum((-1, -2))
+        mises = (_log_bessel(said.kappa) + math.log(2 * math.pi) + _slack(said.kappa)).sum(-1)
+        return (said.modes.exp() * (laplace + mises - said.modes)).sum(-1)
+
+    def divergence(self, logits: Tensor, reference: Tensor) -> Tensor:
+        """See :meth:`~dpa.models.distribution.Distribution.divergence`; a bound from above, mode by mode."""
+        one, other = (Mixture.of(each, self.frames) for each in (logits, reference))
+        apart, scale = (one.mean - other.mean)[..., :2].abs(), one.scale / other.scale
+        laplace = scale * (-apart / one.scale).exp() + apart / other.scale - 1 - scale.log()
+        turned = 2 * ((one.mean - other.mean)[..., 2] / 2).sin().square()  # 1 - cos
+        lost = _slack(one.kappa) / one.kappa  # 1 - I1 / I0
+        mises = _log_bessel(other.kappa) - _log_bessel(one.kappa)
+        mises = mises + (other.kappa - one.kappa) * lost + (1 - lost) * other.kappa * turned
+        frames = laplace.sum((-1, -2)) + mises.sum(-1)
+        return (one.modes.exp() * (one.modes - other.modes + frames)).sum(-1)
+
+    def likeliest(self, logits: Tensor) -> Tensor:
+        """The middle of the most probable mode."""
+        said = Mixture.of(logits, self.frames)
+        return _poses(_of_mode(said.mean, said.modes.argmax(-1)), said.before)
+
+    def hit(self, logits: Tensor, token: Tensor) -> Tensor:
+        """Whether the middle of the most probable mode ends within :data:`NEAR` of the patch."""
+        return (self.likeliest(logits) - token)[..., -3:-1].norm(dim=-1) < NEAR
+
+    def draw(self, logits: Tensor, uniform: Tensor, decoding: Decoding) -> tuple[Tensor, Tensor]:
+        """See :meth:`~dpa.models.distribution.Distribution.draw`: a mode, then its frames."""
+        said = Mixture.of(logits, self.frames).warmer(decoding)
+        mode = draw(said.modes, uniform[..., 0])
+        uniform = uniform[..., 1:].unflatten(-1, (self.frames, 3))
+        mean, scale, kappa = (_of_mode(value, mode) for value in (said.mean, said.scale, said.kappa))
+        moved = _laplace(uniform[..., :2]) * scale
+        turned = _mises(uniform[..., 2], kappa)
+        patch = _poses(mean + torch.cat((moved, turned[..., None]), -1), said.before)
+        return patch, self._log_density(said, patch)
+
+    def _log_density(self, said: Mixture, patch: Tensor) -> Tensor:
+        change = _changes(patch.unflatten(-1, (self.frames, 3)), said.before)[..., None, :, :]  # [*, 1, F, 3]
+        off = change - said.mean
+        laplace = -(off[..., :2].abs() / said.scale) - (2 * said.scale).log()
+        mises = -2 * said.kappa * (off[..., 2] / 2).sin().square() - _log_bessel(said.kappa) - math.log(2 * math.pi)
+        return (said.modes + laplace.sum((-1, -2)) + mises.sum(-1)).logsumexp(-1)
+
+
+def _of_mode(value: Tensor, mode: Tensor) -> Tensor:
+    """``[*, K, ...]`` at ``[*]``."""
+    index = mode.view(*mode.shape, *(1,) * (value.dim() - mode.dim()))
+    return value.gather(mode.dim(), index.expand(*mode.shape, 1, *value.shape[mode.dim() + 1 :])).squeeze(mode.dim())
+
+
+def _changes(poses: Tensor, before: Tensor) -> Tensor:
+    """Second differences ``[*, F, 3]`` of poses that begin at the origin."""
+    steps = torch.cat((before[..., None, :], poses[..., :1, :], poses.diff(dim=-2)), -2)
+    steps = torch.cat((steps[..., :2], wrap_angle(steps[..., 2:])), -1)
+    return steps.diff(dim=-2)
+
+
+def _poses(changes: Tensor, before: Tensor) -> Tensor:
+    """Inverse of :func:`_changes`, as tokens ``[*, 3 * F]``."""
+    poses = (before[..., None, :] + changes.cumsum(-2)).cumsum(-2)
+    return torch.cat((poses[..., :2], wrap_angle(poses[..., 2:])), -1).flatten(-2)
+
+
+def _log_bessel(kappa: Tensor) -> Tensor:
+    """``log I0(kappa) - kappa``."""
+    sure = -(2 * math.pi * kappa).log() / 2 + 1 / (8 * kappa)  # and no overflow of the gradient
+    return torch.where(kappa > SURE, sure, torch.special.i0e(kappa.clamp(max=SURE)).log())
+
+
+def _slack(kappa: Tensor) -> Tensor:
+    """``kappa * (1 - I1(kappa) / I0(kappa))``, which goes to one half."""
+    some = kappa.clamp(max=SURE)
+    exact = some * (1 - torch.special.i1e(some) / torch.special.i0e(some))
+    return torch.where(kappa > SURE, 0.5 + 1 / (8 * kappa) + 1 / (8 * kappa**2), exact)
+
+
+def _laplace(uniform: Tensor) -> Tensor:
+    """A draw of the Laplace density of scale 1, by inversion."""
+    centred = uniform - 0.5
+    return -centred.sign() * torch.log1p(-2 * centred.abs().clamp(max=0.5 - 1e-7))
+
+
+def _mises(uniform: Tensor, kappa: Tensor) -> Tensor:
+    """A draw of the von Mises density around 0, by inversion of a table [rad]."""
+    half = (WIDTH / kappa.sqrt()).clamp(max=math.pi)[..., None]
+    place = half * torch.linspace(-1, 1, CELLS, device=kappa.device)
+    density = (-2 * kappa[..., None] * (place / 2).sin().square()).exp()
+    reached = ((density[..., 1:] + density[..., :-1]) / 2).cumsum(-1)
+    wanted = uniform[..., None] * reached[..., -1:]
+    cell = torch.searchsorted(reached, wanted, right=True).clamp(max=CELLS - 2)
+    below = torch.where(cell > 0, reached.gather(-1, (cell - 1).clamp(min=0)), 0)
+    share = (wanted - below) / (reached.gather(-1, cell) - below).clamp(min=torch.finfo(kappa.dtype).tiny)
+    start, end = place.gather(-1, cell), place.gather(-1, cell + 1)
+    return (start + share * (end - start))[..., 0]
