@@ -1,0 +1,86 @@
+"""Every family of the package goes through everything that a recipe does, by its name alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from dpa.preferences import PreferenceStore
+from dpa.training.checkpoint import load_policy
+from envs import keys
+
+FAMILIES = ("behaviorgpt_nano",)
+families = pytest.mark.parametrize("family", FAMILIES)
+
+
+@pytest.fixture(scope="module", params=FAMILIES)
+def trained(request: pytest.FixtureRequest, run: Callable, options: Callable, tmp_path_factory) -> SimpleNamespace:
+    """A policy of a family that has hardly learnt anything, and rankings of its rollouts."""
+    folder, chosen = tmp_path_factory.mktemp(request.param), f"model={request.param}"
+    for recipe, told in (
+        ("pretrain", [chosen, f"output={folder}"]),
+        ("collect", [f"policy={folder / 'policy.pt'}", f"output={folder / 'ranked'}"]),
+    ):
+        outcome = run(recipe, *options(recipe, *told))
+        assert outcome.status == 0, outcome.err
+    return SimpleNamespace(model=request.param, policy=folder / "policy.pt", ranked=folder / "ranked")
+
+
+@pytest.mark.parametrize(
+    "method",
+    ["dpa_omf", "kto", "listwise", "per_agent", "sft_best_oa", "adversarial_afd", "rloo", "grpo", "dpa_omf_on_policy"],
+)
+def test_it_is_aligned_and_evaluated(
+    trained: SimpleNamespace, run: Callable, options: Callable, tmp_path: Path, method: str
+) -> None:
+    ranked = [] if method in ("rloo", "grpo", "dpa_omf_on_policy") else [f"preferences={trained.ranked}"]
+    told = options("align", f"method={method}", f"policy={trained.policy}", *ranked, f"output={tmp_path / 'aligned'}")
+    outcome = run("align", *told)
+    assert outcome.status == 0, outcome.err
+    before, after = (load_policy(path)[0] for path in (trained.policy, tmp_path / "aligned/policy.pt"))
+    assert any(not torch.equal(before[name], value) for name, value in after.items())
+    assert all(value.isfinite().all() for value in after.values())
+    scored = options("evaluate", f"policy={tmp_path / 'aligned/policy.pt'}", f"json={tmp_path / 'scores.json'}")
+    outcome = run("evaluate", *scored)
+    assert outcome.status == 0, outcome.err
+    assert 0 < json.loads((tmp_path / "scores.json").read_text())["mean"]["realism"] < 1
+
+
+def test_its_rankings_hold_its_patches(trained: SimpleNamespace) -> None:
+    group = PreferenceStore(trained.ranked)[0]
+    assert group[keys.TOKENS].shape[3:] == (8, 30) and group[keys.TOKENS].dtype == torch.float32
+    counts = group[keys.TOKEN_VALID][:, None]
+    assert group[keys.TOKENS][counts.expand(group[keys.TOKENS].shape[:4])].any()
+
+
+def test_a_method_that_needs_a_vocabulary_is_refused_in_one_sentence(
+    trained: SimpleNamespace, run: Callable, options: Callable, tmp_path: Path
+) -> None:
+    outcome = run("align", *options("align", "method=cat_k", f"policy={trained.policy}", f"output={tmp_path}"))
+    assert outcome.status == 2
+    assert "CAT-K follows the log by a policy's own most probable tokens, and patches have none" in outcome.err
+
+
+@families
+@pytest.mark.parametrize(
+    ("told", "message"),
+    [
+        (["pretraining.noise=0.2"], "patches have no neighbours"),
+        (["pretraining.label_smoothing=0.1"], "label_smoothing=0.1 needs a vocabulary"),
+        (["tokenizer@model.tokenizer=verlet"], "set tokenizer=patches"),
+    ],
+)
+def test_an_option_that_needs_a_vocabulary_is_refused(
+    family: str, told: list, message: str, run: Callable, options: Callable, tmp_path: Path
+) -> None:
+    outcome = run("pretrain", *options("pretrain", f"model={family}", *told, f"output={tmp_path}"))
+    assert outcome.status == 2 and message in outcome.err, outcome.err
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])
