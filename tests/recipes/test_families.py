@@ -33,7 +33,7 @@ def trained(request: pytest.FixtureRequest, run: Callable, options: Callable, tm
 
 @pytest.mark.parametrize(
     "method",
-    ["dpa_omf", "kto", "listwise", "per_agent", "sft_best_oa", "adversarial_afd", "rloo", "grpo", "dpa_omf_on_policy"],
+    ["dpa_omf", "kto", "per_agent", "sft_best_oa", "adversarial_afd", "rloo", "grpo", "dpa_omf_on_policy"],
 )
 def test_it_is_aligned_and_evaluated(
     trained: SimpleNamespace, run: Callable, options: Callable, tmp_path: Path, method: str

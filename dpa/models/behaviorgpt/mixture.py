@@ -156,7 +156,8 @@ def _of_mode(value: Tensor, mode: Tensor) -> Tensor:
 
 def _changes(poses: Tensor, before: Tensor) -> Tensor:
     """Second differences ``[*, F, 3]`` of poses that begin at the origin."""
-    steps = torch.cat((before[..., None, :], poses[..., :1, :], poses.diff(dim=-2)), -2)
+    before = before[..., None, :].expand(*poses.shape[:-2], 1, 3)
+    steps = torch.cat((before, poses[..., :1, :], poses.diff(dim=-2)), -2)
     steps = torch.cat((steps[..., :2], wrap_angle(steps[..., 2:])), -1)
     return steps.diff(dim=-2)
 

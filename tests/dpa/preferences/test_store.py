@@ -109,17 +109,23 @@ def test_a_group_of_the_papers_size_takes_at_most_40_kb_even_with_random_tokens(
     rollouts=st.integers(1, 5),
     decisions=st.integers(1, 4),
     shares=st.integers(0, 3),
+    layout=st.sampled_from([TokenLayout(np.int16), TokenLayout(np.float32, (6,))]),
 )
-def test_any_group_comes_back_to_the_last_bit(data, agents: int, rollouts: int, decisions: int, shares: int) -> None:
+def test_any_group_comes_back_to_the_last_bit(
+    data, agents: int, rollouts: int, decisions: int, shares: int, layout: TokenLayout
+) -> None:
     def array(name: str, dtype: type, most: int) -> np.ndarray:
         return data.draw(arrays(dtype, shapes[name], elements=st.integers(0, most)), label=name)
 
-    shapes = group_shapes(agents, rollouts, decisions, shares)
+    shapes = group_shapes(agents, rollouts, decisions, shares, layout.shape)
     bits = {name: array(name, np.uint32, 2**32 - 1).view(np.float32) for name in NUMBERS}
-    whole = {"tokens": array("tokens", np.int16, 2047), "agent_kind": array("agent_kind", np.uint8, 4)}
+    whole = {
+        "tokens": array("tokens", np.int16, 2047).astype(layout.dtype),
+        "agent_kind": array("agent_kind", np.uint8, 4),
+    }
     flags = {name: array(name, np.uint8, 1).astype(bool) for name in ("token_valid", "agent_ranked")}
     group = Group(data.draw(st.integers(0, 2**62)), **bits, **whole, **flags)
-    back = decode(encode(group, TokenLayout(np.int16)), TokenLayout(np.int16))
+    back = decode(encode(group, layout), layout)
     assert back.scene == group.scene
     for name in shapes:
         mine, theirs = getattr(back, name), getattr(group, name)

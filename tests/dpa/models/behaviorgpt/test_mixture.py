@@ -1,0 +1,155 @@
+"""The density of patches: what it says is what it draws, and what scipy says."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+from torch import Tensor
+
+from dpa.models import Decoding
+from dpa.models.behaviorgpt.mixture import CONCENTRATION, Mixture, PatchMixture, _changes, _log_bessel, _mises, _poses
+from dpa.models.registry import build_model, size_of
+from dpa.tokens import PatchTokenizer, VerletTokenizer
+
+WHOLE = Decoding(top_p=1.0)
+
+
+def numbers(modes: int, frames: int, seed: int = 0, spread: float = 1.0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    logits = spread * torch.randn(modes * (1 + 6 * frames) + 3, generator=generator, dtype=torch.float64)
+    logits[-3:] *= 0.1
+    return logits
+
+
+def many(mixture: PatchMixture, logits: Tensor, count: int, decoding: Decoding = WHOLE) -> tuple[Tensor, Tensor]:
+    uniform = torch.rand(count, mixture.numbers, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    return mixture.draw(logits.expand(count, -1), uniform, decoding)
+
+
+def test_one_mode_and_frame_is_what_scipy_says() -> None:
+    logits = torch.tensor([0.3, 0.1, -0.2, 0.05, -1.0, -2.0, 3.0, 0.4, 0.02, 0.01], dtype=torch.float64)
+    patch = torch.tensor([0.6, -0.1, 0.2], dtype=torch.float64)
+    said = Mixture.of(logits, 1)
+    wide, high = said.scale[0, 0].tolist()
+    assert (wide, high) == pytest.approx((math.log1p(math.exp(-1.0)) + 0.001, math.log1p(math.exp(-2.0)) + 0.001))
+    expected = (
+        stats.laplace.logpdf(0.6 - 0.4, 0.1, wide)  # the agent moved by 0.4 m in the step before
+        + stats.laplace.logpdf(-0.1 - 0.02, -0.2, high)
+        + stats.vonmises.logpdf(0.2 - 0.01, math.exp(3.0) + CONCENTRATION[0], loc=0.05)
+    )
+    assert PatchMixture(1).log_prob(logits, patch).item() == pytest.approx(expected, abs=1e-9)
+
+
+def test_it_integrates_to_one() -> None:
+    mixture, logits = PatchMixture(1), numbers(3, 1, seed=2)
+    logits[3:-3].view(3, 1, 6)[..., 3:5] = 1.0  # wider than the grid
+    grid = torch.linspace(-12, 12, 241, dtype=torch.float64)
+    angle = torch.linspace(-math.pi, math.pi, 101, dtype=torch.float64)[:-1]
+    patches = torch.cartesian_prod(grid, grid, angle)
+    density = mixture.log_prob(logits, patches).exp()
+    assert (density.sum() * 0.1 * 0.1 * 2 * math.pi / 100).item() == pytest.approx(1.0, abs=2e-3)
+
+
+def test_what_is_drawn_has_the_density_that_is_told_and_entropy_bounds_it() -> None:
+    mixture, logits = PatchMixture(3), numbers(4, 3)
+    patch, by = many(mixture, logits, 60_000)
+    torch.testing.assert_close(by, mixture.log_prob(logits, patch))
+    drawn = -by.mean().item()
+    assert drawn - 0.05 < mixture.entropy(logits).item() < drawn + math.log(4)
+    single = numbers(1, 3)
+    assert mixture.entropy(single).item() == pytest.approx(-many(mixture, single, 60_000)[1].mean().item(), abs=0.03)
+
+
+@pytest.mark.parametrize("kappa", [4.0, 30.0, 1e3, 1e6])
+def test_angles_are_drawn_as_scipy_says(kappa: float) -> None:
+    uniform = torch.rand(40_000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    drawn = _mises(uniform, torch.full_like(uniform, kappa)).numpy()
+    assert stats.kstest(drawn, stats.vonmises(kappa).cdf).pvalue > 0.01
+
+
+def test_normalisers_hold_for_every_concentration() -> None:
+    kappa = torch.logspace(0, 6, 50, dtype=torch.float64)
+    expected = np.log(np.vectorize(lambda k: stats.vonmises.pdf(0.0, k))(kappa.numpy()))
+    np.testing.assert_allclose(-_log_bessel(kappa).numpy() - math.log(2 * math.pi), expected, rtol=1e-4)
+
+
+def test_divergence_is_zero_of_itself_and_above_what_samples_say() -> None:
+    mixture, one = PatchMixture(3), numbers(4, 3)
+    other = one + 0.2 * numbers(4, 3, seed=5)
+    other[-3:] = one[-3:]
+    patch, by = many(mixture, one, 60_000)
+    sampled = (by - mixture.log_prob(other, patch)).mean().item()
+    assert mixture.divergence(one, one).item() == pytest.approx(0.0, abs=1e-12)
+    assert 0 < sampled - 0.02 < mixture.divergence(one, other).item() < 2 * sampled
+    single, moved = numbers(1, 3), numbers(1, 3)
+    moved[1:-3] += 0.2
+    patch, by = many(mixture, single, 60_000)
+    exact = (by - mixture.log_prob(moved, patch)).mean().item()
+    assert mixture.divergence(single, moved).item() == pytest.approx(exact, rel=0.03)
+
+
+@settings(max_examples=40, deadline=None)
+@given(frames=st.integers(1, 10), seed=st.integers(0, 1000), spread=st.floats(0.0, 3.0))
+def test_poses_and_their_changes_map_onto_each_other(frames: int, seed: int, spread: float) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    changes = spread * torch.rand(frames, 3, generator=generator, dtype=torch.float64) / frames
+    before = torch.rand(3, generator=generator, dtype=torch.float64)
+    back = _changes(_poses(changes, before).unflatten(-1, (frames, 3)), before)
+    torch.testing.assert_close(back, changes, atol=1e-9, rtol=0)
+
+
+def test_gradients_are_finite_where_agents_stand_and_where_densities_are_narrow() -> None:
+    mixture = PatchMixture(10)
+    logits = torch.zeros(5, 16 * 61 + 3)
+    logits[:, 16:-3] = torch.tensor([-50.0, -5.0, 0.0, 5.0, 50.0])[:, None]
+    logits.requires_grad_()
+    total = mixture.log_prob(logits, torch.zeros(5, 30)) + mixture.entropy(logits)
+    (total + mixture.divergence(logits, torch.zeros(5, 16 * 61 + 3))).sum().backward()
+    assert total.isfinite().all() and logits.grad.isfinite().all()
+
+
+def test_a_nucleus_cuts_modes_and_a_temperature_narrows_them() -> None:
+    mixture, logits = PatchMixture(2), torch.zeros(2 * 13 + 3, dtype=torch.float64)
+    logits[0] = 4.0  # 98 % of the first mode, which goes 10 m further each step
+    logits[2:26].view(2, 2, 6)[0, :, 0] = 10.0
+    first, _ = many(mixture, logits, 500, Decoding(top_p=0.9))
+    assert (first[:, 0] > 4).all() and not (many(mixture, logits, 2000)[0][:, 0] > 4).all()
+    calm, _ = many(mixture, logits, 500, Decoding(top_p=0.9, temperature=0.01))
+    middle = mixture.likeliest(logits)
+    assert (calm - middle).abs().max() < 0.3 < (first - middle).abs().max()
+    assert mixture.hit(logits, middle) and not mixture.hit(logits, middle + 2.0)
+
+
+def test_an_untrained_policy_goes_on_as_agents_do() -> None:
+    torch.manual_seed(0)
+    size = size_of("behaviorgpt", "nano")
+    model = build_model({"family": "behaviorgpt", "model": size, "context": {}}, PatchTokenizer()).eval()
+    recent = torch.zeros(1, 11, 3)
+    recent[0, :, 0] = 0.5 * torch.arange(11)
+    with torch.no_grad():
+        patch = model.distribution.likeliest(model.decide(torch.randn(1, 36), recent)).view(10, 3)
+    torch.testing.assert_close(patch[:, 0], 0.5 * torch.arange(1.0, 11.0), atol=0.3, rtol=0)
+
+
+@pytest.mark.parametrize(("size", "published"), [("nano", 0.15e6), ("3m", 3e6)])
+def test_sizes_have_the_parameters_that_they_are_named_for(size: str, published: float) -> None:
+    config = {"family": "behaviorgpt", "model": size_of("behaviorgpt", size), "context": {}}
+    model = build_model(config, PatchTokenizer())
+    assert sum(parameter.numel() for parameter in model.parameters()) == pytest.approx(published, rel=0.1)
+
+
+def test_a_vocabulary_is_refused_and_so_are_patches_elsewhere() -> None:
+    for family, size, tokenizer in (("behaviorgpt", "nano", VerletTokenizer()), ("smart", "nano", PatchTokenizer()),
+                                    ("motionlm", "nano", PatchTokenizer())):  # fmt: skip
+        with pytest.raises(ValueError, match=r"tokenizer"):
+            build_model({"family": family, "model": size_of(family, size), "context": {}}, tokenizer)
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])
