@@ -1,16 +1,15 @@
 """A density of patches: a mixture of modes, each of Laplace and von Mises densities, frame by frame.
 
-A frame goes on from the two before it: a mode says by how much velocity and yaw rate change, and how surely. So noise
-is noise of accelerations, and what is drawn moves smoothly.
+From frame to frame an agent moves by a step, seen along the heading halfway: forwards f, to the left l, while it turns
+by r. A mode says how much f changes and what l and r are, and how surely. So an agent keeps its speed unless a mode
+says otherwise, noise is noise of accelerations, and what is drawn moves smoothly and where it looks.
 
-A patch has the frames ``(x_t, y_t, h_t)``, t = 1 to F, in the agent's own frame. With the second differences
-``a_t = x_t - 2 x_{t-1} + x_{t-2}`` (of x, y and, wrapped, of h), where the frames 0 and -1 are the last two that were
-seen, the density is
+A patch has the frames t = 1 to F; f_0 is the step forwards that was seen last. The density is
 
-    ``p = sum_k pi_k prod_t Laplace(a_t^x; m, b) Laplace(a_t^y; m, b) VonMises(a_t^h; m, kappa)``
+    ``p = sum_k pi_k prod_t Laplace(f_t - f_{t-1}; m, b) Laplace(l_t; m, b) VonMises(r_t; m, kappa)``
 
-with m, b and kappa of mode k and frame t. Second differences and poses map onto each other with determinant 1, so it is
-the density of the poses as well.
+with m, b and kappa of mode k and frame t. Poses and ``(f, l, r)`` map onto each other by turning and adding up, with
+determinant 1, so it is the density of the poses as well [1/m and 1/rad for each frame's numbers].
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from torch.nn.functional import softplus
 
 from dpa.models.distribution import Distribution
 from dpa.models.sampling import Decoding, draw
-from envs.geometry.frames import wrap_angle
+from envs.geometry.frames import rotate, wrap_angle
 
 NEAR = 1.0
 """The most probable patch hits another one that ends so near [m]."""
@@ -45,10 +44,10 @@ class Mixture(NamedTuple):
 
     Attributes:
         modes: ``[*, K]`` log-probabilities.
-        mean: ``[*, K, F, 3]`` of the second differences [m, rad].
+        mean: ``[*, K, F, 3]`` of the change of f, of l and of r [m, rad].
         scale: ``[*, K, F, 2]`` of the Laplace densities [m].
         kappa: ``[*, K, F]`` of the von Mises density.
-        before: ``[*, 3]`` change of the pose over the last step that was seen [m, rad].
+        before: ``[*]`` the last step forwards that was seen [m].
     """
 
     modes: Tensor
@@ -59,13 +58,13 @@ class Mixture(NamedTuple):
 
     @classmethod
     def of(cls, logits: Tensor, frames: int) -> Mixture:
-        """Read ``[*, K + 6 * K * F + 3]`` numbers."""
-        modes = (logits.shape[-1] - 3) // (1 + 6 * frames)
-        weight, rest, before = logits.split((modes, modes * 6 * frames, 3), -1)
+        """Read ``[*, K + 6 * K * F + 1]`` numbers."""
+        modes = (logits.shape[-1] - 1) // (1 + 6 * frames)
+        weight, rest, before = logits.split((modes, modes * 6 * frames, 1), -1)
         mean, spread, sure = rest.unflatten(-1, (modes, frames, 6)).split((3, 2, 1), -1)
         least, most = CONCENTRATION
         kappa = (sure[..., 0].clamp(max=math.log(most))).exp() + least
-        return cls(weight.log_softmax(-1), mean, softplus(spread) + LEAST_SCALE, kappa, before)
+        return cls(weight.log_softmax(-1), mean, softplus(spread) + LEAST_SCALE, kappa, before[..., 0])
 
     def warmer(self, decoding: Decoding) -> Mixture:
         """That of a decoding: modes are cut, and with a temperature all densities are as much wider or narrower."""
@@ -74,7 +73,7 @@ class Mixture(NamedTuple):
 
 
 class PatchMixture(Distribution):
-    """Of patches of F poses, by K modes: P is ``K + 6 K F + 3``.
+    """Of patches of F poses, by K modes: P is ``K + 6 K F + 1``.
 
     Entropy and divergence of a mixture have no closed form. Those here are of the mode and of the frames given the
     mode: bounds from above, exact where modes do not overlap, and 0 where nothing differs.
@@ -86,7 +85,7 @@ class PatchMixture(Distribution):
 
     Examples:
         >>> mixture = PatchMixture(frames=10)
-        >>> logits = torch.zeros(2, 4 * 61 + 3)  # four modes
+        >>> logits = torch.zeros(2, 4 * 61 + 1)  # four modes
         >>> patch, by = mixture.draw(logits, torch.rand(2, mixture.numbers), Decoding(top_p=1.0))
         >>> patch.shape, torch.allclose(by, mixture.log_prob(logits, patch), rtol=1e-3)
         (torch.Size([2, 30]), True)
@@ -155,17 +154,22 @@ def _of_mode(value: Tensor, mode: Tensor) -> Tensor:
 
 
 def _changes(poses: Tensor, before: Tensor) -> Tensor:
-    """Second differences ``[*, F, 3]`` of poses that begin at the origin."""
-    before = before[..., None, :].expand(*poses.shape[:-2], 1, 3)
-    steps = torch.cat((before, poses[..., :1, :], poses.diff(dim=-2)), -2)
-    steps = torch.cat((steps[..., :2], wrap_angle(steps[..., 2:])), -1)
-    return steps.diff(dim=-2)
+    """``[*, F, 3]``: change of f, l and r of poses that begin at the origin, after a step forwards ``[*]``."""
+    poses = torch.cat((torch.zeros_like(poses[..., :1, :]), poses), -2)
+    turned = wrap_angle(poses[..., 2].diff(dim=-1))
+    step = rotate(poses[..., :2].diff(dim=-2), -(poses[..., :-1, 2] + turned / 2))
+    forwards = torch.cat((before.expand(step.shape[:-2])[..., None], step[..., 0]), -1)
+    return torch.stack((forwards.diff(dim=-1), step[..., 1], turned), -1)
 
 
 def _poses(changes: Tensor, before: Tensor) -> Tensor:
     """Inverse of :func:`_changes`, as tokens ``[*, 3 * F]``."""
-    poses = (before[..., None, :] + changes.cumsum(-2)).cumsum(-2)
-    return torch.cat((poses[..., :2], wrap_angle(poses[..., 2:])), -1).flatten(-2)
+    change, left, turned = changes.unbind(-1)
+    turned = wrap_angle(turned)  # half of it says where the step goes
+    heading = turned.cumsum(-1)
+    step = torch.stack((before[..., None] + change.cumsum(-1), left), -1)
+    place = rotate(step, heading - turned / 2).cumsum(-2)
+    return torch.cat((place, wrap_angle(heading)[..., None]), -1).flatten(-2)
 
 
 def _log_bessel(kappa: Tensor) -> Tensor:

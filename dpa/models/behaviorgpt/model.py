@@ -11,7 +11,7 @@ from dpa.models.base import named_size
 from dpa.models.behaviorgpt.mixture import PatchMixture
 from dpa.models.factorised import METRES, FactorisedConfig, FactorisedModel, NeighbourhoodOptions, mlp
 from dpa.tokens.base import MotionTokenizer
-from envs.geometry.frames import to_local
+from envs.geometry.frames import rotate, to_local
 from envs.scene import AgentKind
 
 SPREAD, SURE = -4.0, 7.0
@@ -110,5 +110,6 @@ class BehaviorGPT(FactorisedModel):
             state = self.unroll(when.expand_as(state), state)
             frames.append(self.out(state))
         said = torch.stack(frames, -2).view(*shape[:-1], len(frames), 6)
-        before = -to_local(recent[..., -2, :], recent[..., -1, :])  # how the pose changed last
-        return torch.cat((self.weight(x), said.flatten(-3), before), -1)
+        last = to_local(recent[..., -1, :], recent[..., -2, :])
+        forwards = rotate(last[..., :2], -last[..., 2] / 2)[..., :1]
+        return torch.cat((self.weight(x), said.flatten(-3), forwards), -1)

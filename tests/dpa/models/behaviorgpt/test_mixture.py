@@ -22,8 +22,8 @@ WHOLE = Decoding(top_p=1.0)
 
 def numbers(modes: int, frames: int, seed: int = 0, spread: float = 1.0) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
-    logits = spread * torch.randn(modes * (1 + 6 * frames) + 3, generator=generator, dtype=torch.float64)
-    logits[-3:] *= 0.1
+    logits = spread * torch.randn(modes * (1 + 6 * frames) + 1, generator=generator, dtype=torch.float64)
+    logits[-1:] *= 0.1
     return logits
 
 
@@ -33,22 +33,23 @@ def many(mixture: PatchMixture, logits: Tensor, count: int, decoding: Decoding =
 
 
 def test_one_mode_and_frame_is_what_scipy_says() -> None:
-    logits = torch.tensor([0.3, 0.1, -0.2, 0.05, -1.0, -2.0, 3.0, 0.4, 0.02, 0.01], dtype=torch.float64)
+    logits = torch.tensor([0.3, 0.1, -0.2, 0.05, -1.0, -2.0, 3.0, 0.4], dtype=torch.float64)
     patch = torch.tensor([0.6, -0.1, 0.2], dtype=torch.float64)
     said = Mixture.of(logits, 1)
-    wide, high = said.scale[0, 0].tolist()
-    assert (wide, high) == pytest.approx((math.log1p(math.exp(-1.0)) + 0.001, math.log1p(math.exp(-2.0)) + 0.001))
+    along, across = said.scale[0, 0].tolist()
+    assert (along, across) == pytest.approx((math.log1p(math.exp(-1.0)) + 0.001, math.log1p(math.exp(-2.0)) + 0.001))
+    forwards, left = (0.6 * math.cos(0.1) - 0.1 * math.sin(0.1), -0.1 * math.cos(0.1) - 0.6 * math.sin(0.1))
     expected = (
-        stats.laplace.logpdf(0.6 - 0.4, 0.1, wide)  # the agent moved by 0.4 m in the step before
-        + stats.laplace.logpdf(-0.1 - 0.02, -0.2, high)
-        + stats.vonmises.logpdf(0.2 - 0.01, math.exp(3.0) + CONCENTRATION[0], loc=0.05)
+        stats.laplace.logpdf(forwards - 0.4, 0.1, along)  # the agent moved by 0.4 m in the step before
+        + stats.laplace.logpdf(left, -0.2, across)
+        + stats.vonmises.logpdf(0.2, math.exp(3.0) + CONCENTRATION[0], loc=0.05)
     )
     assert PatchMixture(1).log_prob(logits, patch).item() == pytest.approx(expected, abs=1e-9)
 
 
 def test_it_integrates_to_one() -> None:
     mixture, logits = PatchMixture(1), numbers(3, 1, seed=2)
-    logits[3:-3].view(3, 1, 6)[..., 3:5] = 1.0  # wider than the grid
+    logits[3:-1].view(3, 1, 6)[..., 3:5] = 1.0  # wider than the grid
     grid = torch.linspace(-12, 12, 241, dtype=torch.float64)
     angle = torch.linspace(-math.pi, math.pi, 101, dtype=torch.float64)[:-1]
     patches = torch.cartesian_prod(grid, grid, angle)
@@ -82,13 +83,13 @@ def test_normalisers_hold_for_every_concentration() -> None:
 def test_divergence_is_zero_of_itself_and_above_what_samples_say() -> None:
     mixture, one = PatchMixture(3), numbers(4, 3)
     other = one + 0.2 * numbers(4, 3, seed=5)
-    other[-3:] = one[-3:]
+    other[-1:] = one[-1:]
     patch, by = many(mixture, one, 60_000)
     sampled = (by - mixture.log_prob(other, patch)).mean().item()
     assert mixture.divergence(one, one).item() == pytest.approx(0.0, abs=1e-12)
     assert 0 < sampled - 0.02 < mixture.divergence(one, other).item() < 2 * sampled
     single, moved = numbers(1, 3), numbers(1, 3)
-    moved[1:-3] += 0.2
+    moved[1:-1] += 0.2
     patch, by = many(mixture, single, 60_000)
     exact = (by - mixture.log_prob(moved, patch)).mean().item()
     assert mixture.divergence(single, moved).item() == pytest.approx(exact, rel=0.03)
@@ -99,30 +100,30 @@ def test_divergence_is_zero_of_itself_and_above_what_samples_say() -> None:
 def test_poses_and_their_changes_map_onto_each_other(frames: int, seed: int, spread: float) -> None:
     generator = torch.Generator().manual_seed(seed)
     changes = spread * torch.rand(frames, 3, generator=generator, dtype=torch.float64) / frames
-    before = torch.rand(3, generator=generator, dtype=torch.float64)
+    before = torch.rand((), generator=generator, dtype=torch.float64)
     back = _changes(_poses(changes, before).unflatten(-1, (frames, 3)), before)
     torch.testing.assert_close(back, changes, atol=1e-9, rtol=0)
 
 
 def test_gradients_are_finite_where_agents_stand_and_where_densities_are_narrow() -> None:
     mixture = PatchMixture(10)
-    logits = torch.zeros(5, 16 * 61 + 3)
-    logits[:, 16:-3] = torch.tensor([-50.0, -5.0, 0.0, 5.0, 50.0])[:, None]
+    logits = torch.zeros(5, 16 * 61 + 1)
+    logits[:, 16:-1] = torch.tensor([-50.0, -5.0, 0.0, 5.0, 50.0])[:, None]
     logits.requires_grad_()
     total = mixture.log_prob(logits, torch.zeros(5, 30)) + mixture.entropy(logits)
-    (total + mixture.divergence(logits, torch.zeros(5, 16 * 61 + 3))).sum().backward()
+    (total + mixture.divergence(logits, torch.zeros(5, 16 * 61 + 1))).sum().backward()
     assert total.isfinite().all() and logits.grad.isfinite().all()
 
 
 def test_a_nucleus_cuts_modes_and_a_temperature_narrows_them() -> None:
-    mixture, logits = PatchMixture(2), torch.zeros(2 * 13 + 3, dtype=torch.float64)
+    mixture, logits = PatchMixture(2), torch.zeros(2 * 13 + 1, dtype=torch.float64)
     logits[0] = 4.0  # 98 % of the first mode, which goes 10 m further each step
     logits[2:26].view(2, 2, 6)[0, :, 0] = 10.0
     first, _ = many(mixture, logits, 500, Decoding(top_p=0.9))
     assert (first[:, 0] > 4).all() and not (many(mixture, logits, 2000)[0][:, 0] > 4).all()
     calm, _ = many(mixture, logits, 500, Decoding(top_p=0.9, temperature=0.01))
     middle = mixture.likeliest(logits)
-    assert (calm - middle).abs().max() < 0.3 < (first - middle).abs().max()
+    assert (calm - middle).abs().max() < 1.0 < (first - middle).abs().max()
     assert mixture.hit(logits, middle) and not mixture.hit(logits, middle + 2.0)
 
 
