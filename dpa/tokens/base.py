@@ -124,9 +124,9 @@ class MotionTokenizer(nn.Module):
         tokens, labels, tracks = [], [], []
         for step in range(decisions.shape[-3]):
             target = decisions[..., step, :, :]
-            if noise and recovery < 1 and step:  # nothing is left where the log had no pose to be beside
-                left = (1 - recovery) * ends[..., step - 1, None]
-                target = beside(target, recent[..., -1, :], decisions[..., step - 1, -1, :], left)
+            if noise and step:
+                before = decisions[..., step - 1, -1, :], ends[..., step - 1]
+                target = self.way_back(target, recent, *before, recovery)
             target = to_local(target, recent[..., -1:, :])
             labels.append(self.encode(target, recent, kind))
             tokens.append(self._noisy(labels[-1], kind, noise, drawn[..., step, :]) if noise else labels[-1])
@@ -138,6 +138,20 @@ class MotionTokenizer(nn.Module):
     def alike(self, one: Tensor, other: Tensor) -> Tensor:
         """``[*]`` bool: tokens ``[*, ...]`` that mean the same motion."""
         return one == other
+
+    def way_back(self, target: Tensor, recent: Tensor, start: Tensor, known: Tensor, recovery: float) -> Tensor:
+        """Where a label leads from beside the log: back to it by a share of the offset.
+
+        Args:
+            target: ``[*, F, 3]`` what was logged.
+            recent: ``[*, F + 1, 3]``.
+            start: ``[*, 3]`` where the log was before.
+            known: ``[*]`` bool, it was there; nothing is left of the offset where it was not.
+            recovery: the share.
+        """
+        if recovery == 1:
+            return target
+        return beside(target, recent[..., -1, :], start, (1 - recovery) * known[..., None])
 
     def _noisy(self, token: Tensor, kind: Tensor, noise: float, drawn: Tensor) -> Tensor:
         replaced = self.of_numbers(drawn[..., 0] < noise)

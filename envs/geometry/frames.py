@@ -73,7 +73,7 @@ def beside(path: Tensor, pose: Tensor, start: Tensor, share: float | Tensor) -> 
         path: ``[..., F, 3]``.
         pose: ``[..., 3]`` of who lies beside the path.
         start: ``[..., 3]`` where the path comes from.
-        share: number or ``[..., 1]``; 0 is the path itself.
+        share: number, ``[..., 1]``, or ``[..., F]``, of each pose; 0 is the path itself.
 
     Returns:
         ``[..., F, 3]``.
@@ -83,4 +83,5 @@ def beside(path: Tensor, pose: Tensor, start: Tensor, share: float | Tensor) -> 
         >>> beside(straight, aside, torch.zeros(3), share=0.75)
         tensor([[5.0000, 1.5000, 0.0000]])
     """
-    return to_world((share * to_local(pose, start))[..., None, :], path)
+    offset = to_local(pose, start)[..., None, :]
+    return to_world((share[..., None] if isinstance(share, Tensor) else share) * offset, path)

@@ -70,7 +70,6 @@ def test_a_method_that_needs_a_vocabulary_is_refused_in_one_sentence(
 @pytest.mark.parametrize(
     ("told", "message"),
     [
-        (["pretraining.noise=0.2"], "patches have no neighbours"),
         (["pretraining.label_smoothing=0.1"], "label_smoothing=0.1 needs a vocabulary"),
         (["tokenizer@model.tokenizer=verlet"], "set tokenizer=patches"),
     ],

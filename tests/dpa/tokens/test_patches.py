@@ -8,9 +8,10 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from dpa.tokens import PatchTokenizer, TokenAction
+from dpa.tokens.patches import AHEAD, TURNED
 from envs import keys
 from envs.episode import EpisodeOptions, make_episode
-from envs.geometry.frames import wrap_angle
+from envs.geometry.frames import to_local, to_world, wrap_angle
 from envs.sources.synthetic import straight_road, two_cars_head_on
 from envs.traffic import TrafficEnv
 
@@ -42,6 +43,46 @@ def test_motions_are_alike_within_a_decimetre() -> None:
     tokenizer = PatchTokenizer(2)
     one, other = torch.zeros(3, 6), torch.tensor([0.0, 0.09, 0.11])[:, None].expand(3, 6)
     assert tokenizer.alike(one, other).tolist() == [True, True, False]
+
+
+def test_noise_ends_a_little_elsewhere_and_labels_lead_back() -> None:
+    tokenizer, options = PatchTokenizer(), EpisodeOptions(decision_steps=10, horizon=8)
+    episode = make_episode(straight_road(6, seed=3), options)
+    drawn = torch.rand(6, 8, 3, generator=torch.Generator().manual_seed(0))
+    given = (episode.logged, episode.logged_valid, episode.recent, episode.kind)
+    exact, noisy = tokenizer.encode_tracks(*given), tokenizer.encode_tracks(*given, noise=1.0, drawn=drawn)
+    ends = tokenizer.decode(noisy.tokens, noisy.tokens, episode.kind)[..., -1, :]
+    wanted = tokenizer.decode(noisy.labels, noisy.labels, episode.kind)[..., -1, :]
+    apart = (ends - wanted)[..., :2].norm(dim=-1)
+    assert 0.05 < apart.mean() < AHEAD + 0.3 and apart.max() < 1.0
+    assert (ends - wanted)[..., 2].abs().max() <= TURNED + 1e-5
+    first, later = exact.tokens, noisy.labels
+    assert torch.equal(first[:, 0], later[:, 0]) and not torch.allclose(first[:, 1:], later[:, 1:])
+    # The label of each decision ends where the log does, from wherever the noise has led.
+    reached = torch.cat((episode.recent[:, None, -1], noisy.poses.unflatten(1, (8, 10))[:, :-1, -1]), 1)
+    back = to_world(wanted, reached)
+    torch.testing.assert_close(back[..., :2], episode.logged.unflatten(1, (8, 10))[:, :, -1, :2], atol=1e-3, rtol=0)
+
+
+def test_a_label_that_comes_back_is_no_jump() -> None:
+    tokenizer, options = PatchTokenizer(), EpisodeOptions(decision_steps=10, horizon=8)
+    episode = make_episode(straight_road(6, seed=3), options)
+    drawn = torch.rand(6, 8, 3, generator=torch.Generator().manual_seed(0))
+    given = (episode.logged, episode.logged_valid, episode.recent, episode.kind)
+    for recovery in (0.25, 1.0):
+        noisy = tokenizer.encode_tracks(*given, noise=1.0, recovery=recovery, drawn=drawn)
+        labels = tokenizer.decode(noisy.labels, noisy.labels, episode.kind)[:, 1:]
+        reached = torch.cat((episode.recent[:, None, 1:], noisy.poses.unflatten(1, (8, 10))[:, :-1]), 1)[:, 1:]
+        before = to_local(reached[..., -2:, :], reached[..., -1:, :])
+        accelerations = torch.cat((before, labels), -2)[..., :2].diff(dim=-2).diff(dim=-2).norm(dim=-1) / 0.01
+        assert accelerations.max() < 8.0
+
+
+def test_a_patch_that_stands_is_not_turned() -> None:
+    tokenizer = PatchTokenizer()
+    still = torch.zeros(50, 30)
+    moved = tokenizer.decode(tokenizer.neighbour(still, torch.ones(50), torch.rand(50, 2)), still, torch.ones(50))
+    assert not moved[..., 1:].any() and moved[..., 0].any()
 
 
 def test_a_patch_without_poses_is_refused() -> None:
