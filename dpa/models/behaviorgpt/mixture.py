@@ -27,6 +27,8 @@ from envs.geometry.frames import rotate, wrap_angle
 
 NEAR = 1.0
 """The most probable patch hits another one that ends so near [m]."""
+UNIT = 0.02
+"""Of the means [m, rad], so that a number of size 1 is a usual one: a change of speed by 2 m/s^2."""
 LEAST_SCALE = 0.001
 """Of a Laplace density [m]: agents that stand do not move at all, and a density must have an end."""
 CONCENTRATION = (4.0, 1e6)
@@ -64,7 +66,7 @@ class Mixture(NamedTuple):
         mean, spread, sure = rest.unflatten(-1, (modes, frames, 6)).split((3, 2, 1), -1)
         least, most = CONCENTRATION
         kappa = (sure[..., 0].clamp(max=math.log(most))).exp() + least
-        return cls(weight.log_softmax(-1), mean, softplus(spread) + LEAST_SCALE, kappa, before[..., 0])
+        return cls(weight.log_softmax(-1), UNIT * mean, softplus(spread) + LEAST_SCALE, kappa, before[..., 0])
 
     def warmer(self, decoding: Decoding) -> Mixture:
         """That of a decoding: modes are cut, and with a temperature all densities are as much wider or narrower."""

@@ -88,7 +88,7 @@ class BehaviorGPT(FactorisedModel):
     @torch.no_grad()
     def _calm(self) -> None:
         """At first all modes go on as agents do, with little noise: a density far off would drown what is learnt."""
-        self.out.weight.mul_(0.01)
+        self.out.weight.mul_(0.1)
         self.out.bias.copy_(torch.tensor([0.0, 0.0, 0.0, SPREAD, SPREAD, SURE]))
 
     def embed(self, recent: Tensor, token: Tensor, kind: Tensor, extent: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from scipy import stats
 from torch import Tensor
 
 from dpa.models import Decoding
-from dpa.models.behaviorgpt.mixture import CONCENTRATION, Mixture, PatchMixture, _changes, _log_bessel, _mises, _poses
+from dpa.models.behaviorgpt.mixture import CONCENTRATION, UNIT, Mixture, PatchMixture, _changes, _log_bessel, _mises, _poses
 from dpa.models.registry import build_model, size_of
 from dpa.tokens import PatchTokenizer, VerletTokenizer
 
@@ -33,7 +33,7 @@ def many(mixture: PatchMixture, logits: Tensor, count: int, decoding: Decoding =
 
 
 def test_one_mode_and_frame_is_what_scipy_says() -> None:
-    logits = torch.tensor([0.3, 0.1, -0.2, 0.05, -1.0, -2.0, 3.0, 0.4], dtype=torch.float64)
+    logits = torch.tensor([0.3, 0.1 / UNIT, -0.2 / UNIT, 0.05 / UNIT, -1.0, -2.0, 3.0, 0.4], dtype=torch.float64)
     patch = torch.tensor([0.6, -0.1, 0.2], dtype=torch.float64)
     said = Mixture.of(logits, 1)
     along, across = said.scale[0, 0].tolist()
@@ -118,7 +118,7 @@ def test_gradients_are_finite_where_agents_stand_and_where_densities_are_narrow(
 def test_a_nucleus_cuts_modes_and_a_temperature_narrows_them() -> None:
     mixture, logits = PatchMixture(2), torch.zeros(2 * 13 + 1, dtype=torch.float64)
     logits[0] = 4.0  # 98 % of the first mode, which goes 10 m further each step
-    logits[2:26].view(2, 2, 6)[0, :, 0] = 10.0
+    logits[2:26].view(2, 2, 6)[0, :, 0] = 10.0 / UNIT
     first, _ = many(mixture, logits, 500, Decoding(top_p=0.9))
     assert (first[:, 0] > 4).all() and not (many(mixture, logits, 2000)[0][:, 0] > 4).all()
     calm, _ = many(mixture, logits, 500, Decoding(top_p=0.9, temperature=0.01))
