@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from dpa.models.base import Decision, MotionModel, Observation
+from dpa.models.base import Decision, MotionModel, Observation, of_agents
 from dpa.models.context import Context, Contexts, collate_contexts, pad_context
 from dpa.models.distribution import Distribution
 from dpa.models.precision import Precision, check_precision, running_in
@@ -66,19 +66,6 @@ class Likeliest:
     def __call__(self, logits: Tensor, agents: Tensor | None = None) -> Tensor:
         """See :class:`Chooser`."""
         return self.distribution.likeliest(logits)
-
-
-def of_agents(value: Tensor, agents: Tensor | None) -> Tensor:
-    """``[B, A, ...]`` of some agents ``[B, n]``, or of all.
-
-    Examples:
-        >>> of_agents(torch.tensor([[10, 11, 12]]), torch.tensor([[2]]))
-        tensor([[12]])
-    """
-    if agents is None:
-        return value
-    index = agents.view(*agents.shape, *(1,) * (value.dim() - 2)).expand(*agents.shape, *value.shape[2:])
-    return value.gather(1, index)
 
 
 class MotionActor(TensorDictModuleBase):

@@ -45,6 +45,24 @@ class Choose(Protocol):
         """
 
 
+def of_agents(value: Tensor, agents: Tensor | None) -> Tensor:
+    """``[B, A, ...]`` of some agents ``[B, n]``, or of all.
+
+    Args:
+        value: of B rows.
+        agents: which, of each row.
+
+    Examples:
+        >>> import torch
+        >>> of_agents(torch.tensor([[10, 11, 12]]), torch.tensor([[2]]))
+        tensor([[12]])
+    """
+    if agents is None:
+        return value
+    index = agents.view(*agents.shape, *(1,) * (value.dim() - 2)).expand(*agents.shape, *value.shape[2:])
+    return value.gather(1, index)
+
+
 class Decision(NamedTuple):
     """What was chosen at a decision.
 

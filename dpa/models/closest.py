@@ -6,8 +6,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from dpa.models.actor import MotionActor, of_agents
-from dpa.models.base import MotionModel
+from dpa.models.actor import MotionActor
+from dpa.models.base import MotionModel, of_agents
 from dpa.models.context import Contexts
 from dpa.tokens.base import MotionTokenizer
 from envs import keys

@@ -7,49 +7,15 @@ who it is. It attends to the nodes of all agents up to its own decision, which h
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from dpa.models.motionlm.attention import (
-    GAZE,
-    FeedForward,
-    KeyValues,
-    NodeAttention,
-    NodeMasks,
-    RelativeAttention,
-    added,
-)
-from dpa.models.motionlm.encoder import LENGTH_SCALE, SceneTokens
-from dpa.models.motionlm.vicinity import Vicinity
-from envs.geometry.frames import rotate, wrap_angle
-from envs.scene import AgentKind
-
-NEAREST_PIECES, NEAREST_AGENTS = 16, 8
-"""Map pieces (with lights) and agents that a node reads one by one."""
-SPEED_SCALE = 5.0
-"""Metres of a decision's displacement that count as one in a feature."""
-
-
-class SceneMemory(NamedTuple):
-    """What decoding needs of an encoded scene; made once for all its rollouts.
-
-    Attributes:
-        layers: keys and values of the scene for each decoder layer.
-        mask: ``[S, 1, 1, n]`` bool.
-        surroundings: the tokens themselves, without agents: ``[S, n - A, width]``.
-        surroundings_pose: ``[S, n - A, 3]``.
-        agents: ``[S, A, width]`` scene embedding of each agent.
-        extent: ``[S, A, 3]`` [m].
-    """
-
-    layers: tuple[KeyValues, ...]
-    mask: Tensor
-    surroundings: Tensor
-    surroundings_pose: Tensor
-    agents: Tensor
-    extent: Tensor
+from dpa.models.attention import GAZE, KeyValues, NodeAttention, NodeMasks, added
+from dpa.models.decoder import NodeDecoder
+from dpa.models.encoder import SceneMemory, motion_features
 
 
 class NodeInputs(NamedTuple):
@@ -70,35 +36,7 @@ class NodeInputs(NamedTuple):
     valid: Tensor
 
 
-class DecoderLayer(nn.Module):
-    """Attention to nodes, attention to the scene, feed-forward; all pre-norm."""
-
-    def __init__(self, width: int, heads: int, feed: int, dropout: float) -> None:
-        super().__init__()
-        self.norm_nodes, self.nodes = nn.LayerNorm(width), NodeAttention(width, heads)
-        self.norm_scene, self.scene = nn.LayerNorm(width), RelativeAttention(width, heads)
-        self.norm_feed, self.feed = nn.LayerNorm(width), FeedForward(width, feed)
-        self.dropout = nn.Dropout(dropout)
-
-    def remember(self, x: Tensor, pose: Tensor) -> KeyValues:
-        """Keys and values of nodes ``x`` for this layer."""
-        return self.nodes.remember(self.norm_nodes(x), pose)
-
-    def forward(
-        self, x: Tensor, pose: Tensor, nodes: KeyValues, masks: NodeMasks, memory: SceneMemory, index: int
-    ) -> Tensor:
-        """Nodes ``x`` ``[B, Q, width]`` after layer ``index``; ``nodes`` are all that they may look at."""
-        agents, scene = memory.agents.shape[1], memory.layers[index]
-        x = x + self.dropout(self.nodes(self.norm_nodes(x), pose, nodes, masks, agents))
-        # The scene is shared by its rollouts: fold them into the queries instead of repeating keys and values.
-        scenes = scene.keys.shape[0]
-        folded = (t.unflatten(0, (scenes, -1)).flatten(1, 2) for t in (self.norm_scene(x), pose))
-        seen = self.scene(*folded, scene, memory.mask)
-        x = x + self.dropout(seen.view_as(x))
-        return x + self.dropout(self.feed(self.norm_feed(x)))
-
-
-class MotionDecoder(nn.Module):
+class MotionDecoder(NodeDecoder):
     """Logits of the next token of every node.
 
     Args:
@@ -114,30 +52,7 @@ class MotionDecoder(nn.Module):
     def __init__(
         self, vocab_size: int, width: int, heads: int, feed: int, layers: int, horizon: int, dropout: float = 0.0
     ) -> None:
-        super().__init__()
-        self.motion = nn.Sequential(nn.Linear(8, width), nn.GELU(), nn.Linear(width, width))
-        self.token = nn.Embedding(vocab_size + 1, width)
-        self.time = nn.Embedding(horizon, width)
-        self.kind = nn.Embedding(len(AgentKind), width)
-        self.identity = nn.Linear(width, width)
-        self.map_vicinity = Vicinity(width, NEAREST_PIECES)
-        self.agent_vicinity = Vicinity(width, NEAREST_AGENTS)
-        self.layers = nn.ModuleList(DecoderLayer(width, heads, feed, dropout) for _ in range(layers))
-        self.norm = nn.LayerNorm(width)
-        self.head = nn.Linear(width, vocab_size)
-
-    def read_scene(self, tokens: SceneTokens, extent: Tensor) -> SceneMemory:
-        """Keys and values of an encoded scene, for :meth:`forward`."""
-        layers = tuple(layer.scene.remember(tokens.x, tokens.pose) for layer in self.layers)
-        things = tokens.x.shape[1] - tokens.num_agents
-        return SceneMemory(
-            layers,
-            tokens.valid[:, None, None, :],
-            tokens.x[:, :things],
-            tokens.pose[:, :things],
-            tokens.agents,
-            extent,
-        )
+        super().__init__(vocab_size, width, heads, feed, layers, horizon, dropout, NodeAttention)
 
     def forward(
         self,
@@ -157,20 +72,19 @@ class MotionDecoder(nn.Module):
         Returns:
             ``[B, Q, V]``.
         """
-        pose = nodes.recent[:, :, -1]
+        pose, agents = nodes.recent[:, :, -1], memory.agents.shape[1]
         x = self._look_around(self._embed(nodes, memory), nodes, memory)
         for index, layer in enumerate(self.layers):
             own = layer.remember(x, pose)
             seen = own if cache is None else cache.add(index, own)
-            x = layer(x, pose, seen, masks, memory, index)
+            look = partial(layer.nodes, pose=pose, memory=seen, masks=masks, agents=agents)
+            x = layer(x, pose, look, memory, index)
         return self.head(self.norm(x))
 
     def _look_around(self, x: Tensor, nodes: NodeInputs, memory: SceneMemory) -> Tensor:
         """Add what lies next to each node: map pieces and lights, and the other agents at the same decision."""
         pose, agents = nodes.recent[:, :, -1], memory.agents.shape[1]
-        folded = pose.unflatten(0, (len(memory.agents), -1)).flatten(1, 2)
-        mask = memory.mask[:, 0, :, : memory.surroundings.shape[1]]
-        x = x + self.map_vicinity(folded, memory.surroundings, memory.surroundings_pose, mask).view_as(x)
+        x = x + memory.look_around(self.map_vicinity, pose)
         # Nodes of one decision side by side: [B * decisions, A].
         together, at = (value.unflatten(1, (-1, agents)).flatten(0, 1) for value in (x, pose))
         others = ~torch.eye(agents, dtype=torch.bool, device=x.device)
@@ -184,13 +98,7 @@ class MotionDecoder(nn.Module):
         def each_node(per_agent: Tensor) -> Tensor:
             return per_agent.repeat_interleave(rollouts, 0).repeat(1, decisions, 1)
 
-        first, current = nodes.recent[:, :, 0], nodes.recent[:, :, -1]
-        moved = rotate(current[..., :2] - first[..., :2], -current[..., 2])
-        turned = wrap_angle(current[..., 2:] - first[..., 2:])
-        half = nodes.recent[:, :, nodes.recent.shape[2] // 2]
-        late = rotate(current[..., :2] - half[..., :2], -current[..., 2])
-        extent = each_node(memory.extent) / LENGTH_SCALE
-        motion = self.motion(torch.cat((moved / SPEED_SCALE, late / SPEED_SCALE, turned, extent), -1))
+        motion = self.motion(motion_features(nodes.recent, each_node(memory.extent)))
         who = each_node(self.identity(memory.agents))
         return motion + self.token(nodes.token) + self.time(nodes.step) + self.kind(nodes.kind) + who
 

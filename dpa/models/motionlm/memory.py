@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 import torch
 
 from dpa.models.base import Choose, Decision, Observation
-from dpa.models.motionlm.context import SceneContext
-from dpa.models.motionlm.decoder import NodeCache, NodeInputs, SceneMemory
+from dpa.models.encoder import SceneMemory
+from dpa.models.motionlm.decoder import NodeCache, NodeInputs
+from dpa.models.scene import SceneContext
 
 if TYPE_CHECKING:
     from dpa.models.motionlm.model import MotionLM

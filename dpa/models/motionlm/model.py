@@ -8,14 +8,15 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from dpa.models.attention import GAZE, NodeMasks, added
 from dpa.models.base import MotionModel, named_size
 from dpa.models.context import Featurize
+from dpa.models.encoder import SceneEncoder, SceneMemory
 from dpa.models.forcing import shown_by
-from dpa.models.motionlm.attention import GAZE, NodeMasks, added
-from dpa.models.motionlm.context import ContextOptions, SceneContext, featurize
-from dpa.models.motionlm.decoder import NEAREST_PIECES, MotionDecoder, NodeInputs, SceneMemory
-from dpa.models.motionlm.encoder import SceneEncoder
+from dpa.models.motionlm.decoder import MotionDecoder, NodeInputs
 from dpa.models.motionlm.memory import RolloutMemory
+from dpa.models.scene import ContextOptions, SceneContext, featurize
+from dpa.models.vicinity import NEAREST_PIECES
 from dpa.tokens.base import MotionTokenizer, check_vocabulary
 
 

@@ -12,6 +12,8 @@ from torch import Tensor, nn
 from dpa.models.neighbours import gather, nearest, rows_of
 from envs.geometry.frames import to_local
 
+NEAREST_PIECES, NEAREST_AGENTS = 16, 8
+"""Map pieces (with lights) and agents that a node reads one by one."""
 SCALE = 10.0
 """Metres that count as one in a feature."""
 FEATURES = 5

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dpa.models.motionlm.attention import GAZE, METRES, KeyValues, NodeAttention, NodeMasks, RelativeAttention, added
+from dpa.models.attention import GAZE, METRES, KeyValues, NodeAttention, NodeMasks, RelativeAttention, added
 from envs.geometry.frames import rotate, to_local, to_world
 
 WIDTH, HEADS = 32, 2

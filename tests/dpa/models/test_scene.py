@@ -12,7 +12,7 @@ from torch import Tensor
 from dpa.models import collate_contexts, make_context
 from dpa.models.context import keep_agents
 from dpa.models.motionlm import ContextOptions, featurize
-from dpa.models.motionlm.context import PIECE_POINTS
+from dpa.models.scene import PIECE_POINTS
 from envs.episode import HISTORY, EpisodeOptions
 from envs.geometry.frames import to_world
 from envs.scene import CURRENT_STEP, LightState, MapKind, Scene

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dpa.models.motionlm.vicinity import SCALE, Vicinity
+from dpa.models.vicinity import SCALE, Vicinity
 from envs.geometry.frames import to_local, to_world
 
 WIDTH = 16

@@ -1,4 +1,4 @@
-"""What MotionLM sees of a scene: map pieces and lights, and its agents' histories, each in a frame of its own.
+"""What the scene encoder reads: map pieces and lights, and agents' histories, each in a frame of its own.
 
 Long polylines are cut into pieces of about ten metres. A piece, a light or an agent is a pose plus features measured
 from that pose, so nothing here depends on where the scene lies or how it is turned (but for which of the farthest
@@ -26,14 +26,14 @@ NUM_LIGHT_STATES = len(LightState)
 
 @dataclass(frozen=True)
 class ContextOptions(PieceOptions):
-    """How a scene is cut up for MotionLM."""
+    """How a scene is cut up for the encoder."""
 
     max_pieces: int = 512
     piece_length: float = 12.0
 
 
 class SceneContext(TensorClass["nocast"]):
-    """Inputs of MotionLM for one scene, or for a padded batch of them (``*`` is nothing or ``S``).
+    """Inputs of a :class:`~dpa.models.encoder.SceneEncoder`: one scene, or a padded batch (``*`` is nothing or ``S``).
 
     Attributes:
         episode: its agents.

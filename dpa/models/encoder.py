@@ -2,18 +2,75 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from dpa.models.motionlm.attention import FeedForward, RelativeAttention
-from dpa.models.motionlm.context import NUM_LIGHT_STATES, PIECE_POINTS, POSITION_SCALE, SceneContext
+from dpa.models.attention import FeedForward, KeyValues, RelativeAttention
+from dpa.models.scene import NUM_LIGHT_STATES, PIECE_POINTS, POSITION_SCALE, SceneContext
+from dpa.models.vicinity import Vicinity
 from envs.episode import HISTORY, Episode
+from envs.geometry.frames import rotate, wrap_angle
 from envs.scene import NUM_MAP_KINDS, AgentKind
 
 LENGTH_SCALE = 5.0
 """Metres of a box side that count as one in a feature."""
+SPEED_SCALE = 5.0
+"""Metres of a decision's displacement that count as one in a feature."""
+
+
+def motion_features(recent: Tensor, extent: Tensor) -> Tensor:
+    """How an agent moved in a decision, seen from where it is, and its size: ``[*, 8]``.
+
+    Args:
+        recent: ``[*, F + 1, 3]`` poses of the decision.
+        extent: ``[*, 3]`` [m].
+
+    Examples:
+        >>> motion_features(torch.tensor([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]]), torch.tensor([5.0, 2.0, 1.5]))
+        tensor([1.0000, 0.0000, 0.0000, 0.0000, 0.0000, 1.0000, 0.4000, 0.3000])
+    """
+    first, half, current = recent[..., 0, :], recent[..., recent.shape[-2] // 2, :], recent[..., -1, :]
+    moved = rotate(current[..., :2] - first[..., :2], -current[..., 2])
+    late = rotate(current[..., :2] - half[..., :2], -current[..., 2])
+    turned = wrap_angle(current[..., 2:] - first[..., 2:])
+    return torch.cat((moved / SPEED_SCALE, late / SPEED_SCALE, turned, extent / LENGTH_SCALE), -1)
+
+
+class SceneMemory(NamedTuple):
+    """What decoding needs of an encoded scene; made once for all its rollouts.
+
+    Attributes:
+        layers: keys and values of the scene for each decoder layer.
+        mask: ``[S, 1, 1, n]`` bool.
+        surroundings: the tokens themselves, without agents: ``[S, n - A, width]``.
+        surroundings_pose: ``[S, n - A, 3]``.
+        agents: ``[S, A, width]`` scene embedding of each agent.
+        extent: ``[S, A, 3]`` [m].
+    """
+
+    layers: tuple[KeyValues, ...]
+    mask: Tensor
+    surroundings: Tensor
+    surroundings_pose: Tensor
+    agents: Tensor
+    extent: Tensor
+
+    def look(self, attention: RelativeAttention, index: int, x: Tensor, pose: Tensor) -> Tensor:
+        """What B rollouts' nodes ``x`` ``[B, Q, width]`` at ``pose`` see of their scenes in layer ``index``."""
+        return attention(self._folded(x), self._folded(pose), self.layers[index], self.mask).view_as(x)
+
+    def look_around(self, vicinity: Vicinity, pose: Tensor) -> Tensor:
+        """``[B, Q, width]``: what lies next to nodes at ``pose`` ``[B, Q, 3]``, map pieces and lights."""
+        mask = self.mask[:, 0, :, : self.surroundings.shape[1]]
+        seen = vicinity(self._folded(pose), self.surroundings, self.surroundings_pose, mask)
+        return seen.view(*pose.shape[:2], seen.shape[-1])
+
+    def _folded(self, value: Tensor) -> Tensor:
+        # The scene is shared by its rollouts: fold them into the queries instead of repeating keys and values.
+        return value.unflatten(0, (len(self.mask), -1)).flatten(1, 2)
 
 
 class SceneTokens(NamedTuple):
@@ -36,6 +93,18 @@ class SceneTokens(NamedTuple):
         """``[S, A, width]``: the scene embedding of each agent."""
         return self.x[:, self.x.shape[1] - self.num_agents :]
 
+    def remembered(self, attentions: Iterable[RelativeAttention], extent: Tensor) -> SceneMemory:
+        """The scene as decoder layers look at it.
+
+        Args:
+            attentions: to the scene, of each layer.
+            extent: ``[S, A, 3]`` of the agents [m].
+        """
+        layers = tuple(attention.remember(self.x, self.pose) for attention in attentions)
+        things = self.x.shape[1] - self.num_agents
+        mask = self.valid[:, None, None, :]
+        return SceneMemory(layers, mask, self.x[:, :things], self.pose[:, :things], self.agents, extent)
+
 
 class EncoderLayer(nn.Module):
     """Pre-norm self-attention with relative poses, then a feed-forward layer."""
@@ -54,7 +123,7 @@ class EncoderLayer(nn.Module):
 
 
 class SceneEncoder(nn.Module):
-    """Encodes a :class:`~dpa.models.motionlm.context.SceneContext`.
+    """Encodes a :class:`~dpa.models.scene.SceneContext`.
 
     Args:
         width: channels of a token.
@@ -65,7 +134,7 @@ class SceneEncoder(nn.Module):
 
     Examples:
         >>> from dpa.models.context import collate_contexts, make_context
-        >>> from dpa.models.motionlm.context import featurize
+        >>> from dpa.models.scene import featurize
         >>> from envs.sources.synthetic import straight_road
         >>> context = make_context(straight_road(2), featurize)
         >>> SceneEncoder(32, 2, 64, 1)(collate_contexts([context])).agents.shape

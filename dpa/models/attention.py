@@ -240,15 +240,19 @@ class NodeAttention(RelativeAttention):
     @torch.compiler.disable  # torch 2.13 compiles attention over a part of the heads to wrong numbers on a CPU
     def _look(self, query: Tensor, memory: KeyValues, masks: NodeMasks, agents: int) -> Tensor:
         """``[B, H, m, D + GAZE]``: the own past in the first heads, everybody in the rest."""
+        own = self._along(query, memory, masks.own, agents)
+        return torch.cat((own, self._everybody(query, memory, masks.everybody, DECISIONS * agents)), 1)
+
+    def _along(self, query: Tensor, memory: KeyValues, mask: Tensor, agents: int) -> Tensor:
+        """``[B, own, m, D + GAZE]``: what the first heads see."""
 
         def by_agent(heads: Tensor) -> Tensor:
             """``[B, H, decisions * A, D]`` to ``[B * A, own, decisions, D]``."""
             return heads[:, : self.own].unflatten(2, (-1, agents)).permute(0, 3, 1, 2, 4).flatten(0, 1)
 
         past = KeyValues(by_agent(memory.keys), by_agent(memory.values))
-        own = self._attend(by_agent(query), past, masks.own)
-        own = own.unflatten(0, (len(query), agents)).permute(0, 2, 3, 1, 4).flatten(2, 3)
-        return torch.cat((own, self._everybody(query, memory, masks.everybody, DECISIONS * agents)), 1)
+        seen = self._attend(by_agent(query), past, mask)
+        return seen.unflatten(0, (len(query), agents)).permute(0, 2, 3, 1, 4).flatten(2, 3)
 
     def _everybody(self, query: Tensor, memory: KeyValues, mask: Tensor, chunk: int) -> Tensor:
         """What the other heads see: some decisions at a time where all are there, up to the last of each lot."""
