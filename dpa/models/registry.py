@@ -6,9 +6,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
-from dpa.models import behaviorgpt, motionlm, smart
+from dpa.models import behaviorgpt, motionlm, smart, trajeglish
 from dpa.models.base import MotionModel
 from dpa.models.factorised import NeighbourhoodOptions
+from dpa.models.scene import ContextOptions
 from dpa.tokens.base import MotionTokenizer
 
 
@@ -27,8 +28,9 @@ class Family(NamedTuple):
 
 
 FAMILIES: dict[str, Family] = {
-    "motionlm": Family(motionlm.MotionLM, motionlm.SIZES, motionlm.ContextOptions),
+    "motionlm": Family(motionlm.MotionLM, motionlm.SIZES, ContextOptions),
     "smart": Family(smart.SMART, smart.SIZES, NeighbourhoodOptions),
+    "trajeglish": Family(trajeglish.Trajeglish, trajeglish.SIZES, ContextOptions),
     "behaviorgpt": Family(behaviorgpt.BehaviorGPT, behaviorgpt.SIZES, NeighbourhoodOptions),
 }
 """Families that a YAML can name; add one of your own here (docs/how-to.md)."""

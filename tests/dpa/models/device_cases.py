@@ -24,7 +24,7 @@ from dpa.models.registry import build_model, size_of
 from dpa.tokens import KDisksTokenizer, MotionTokenizer, VerletTokenizer
 
 DEVICE = "nowhere"
-SMALLEST = {"motionlm": "nano", "smart": "nano"}
+SMALLEST = {"motionlm": "nano", "smart": "nano", "trajeglish": "nano"}
 families = pytest.mark.parametrize("family", sorted(SMALLEST))
 TOKENIZERS: dict[str, Callable[[], MotionTokenizer]] = {
     "verlet": VerletTokenizer,

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from dpa.models import Contexts, MotionActor, MotionModel, collate_contexts, make_context
 from dpa.models.context import keep_agents, pad_context
@@ -20,7 +22,7 @@ from envs.episode import EpisodeOptions
 from envs.scene import Scene
 from envs.traffic import TrafficEnv
 
-SMALLEST = {"behaviorgpt": "nano", "motionlm": "nano", "smart": "nano"}
+SMALLEST = {"behaviorgpt": "nano", "motionlm": "nano", "smart": "nano", "trajeglish": "nano"}
 PATCHES = ("behaviorgpt",)
 """Families that predict poses and no tokens of a vocabulary."""
 families = pytest.mark.parametrize("family", sorted(SMALLEST))
@@ -131,15 +133,29 @@ def test_where_a_scene_lies_changes_nothing(family: str, motion: tuple, scene: C
     torch.testing.assert_close(other, mine, atol=2e-3, rtol=0)
 
 
+def nobody(context: Any, agent: int) -> Tensor:
+    return torch.zeros_like(context.episode.valid)
+
+
+def those_farther_from_the_sdc(context: Any, agent: int) -> Tensor:
+    places = context.episode.recent[:, -1, :2]
+    away = (places - places[0]).norm(dim=-1)  # the SDC of these scenes is their first agent
+    return away > away[agent]
+
+
+SEEN_AT_ONCE = {"behaviorgpt": nobody, "motionlm": nobody, "smart": nobody, "trajeglish": those_farther_from_the_sdc}
+"""Who sees the token of an agent in the decision that it is of; everybody may from the next one on."""
+
+
 @families
-def test_a_token_is_seen_from_the_next_decision_on(family: str, scene: Callable) -> None:
+def test_a_token_is_seen_by_those_who_decide_after_it(family: str, scene: Callable) -> None:
     model = make(family)
     tokens = tokens_for(model, 4)
     context, other = make_context(scene(4, leave=False), model.featurize), tokens.clone()
     other[:, :, 1, 6] = 13 * 12 if model.tokenizer.vocab_size else tokens[:, :, 1, 6] / 2
-    left, right = logits_of(model, context, tokens), logits_of(model, context, other)
-    assert torch.equal(left[:, :, :, :7], right[:, :, :, :7])
-    changed = (left != right).any(-1)
+    changed = (logits_of(model, context, tokens) != logits_of(model, context, other)).any(-1)
+    assert not changed[..., :6].any()
+    assert torch.equal(changed[..., 6], SEEN_AT_ONCE[family](context, 1).expand(1, 2, 4))
     assert changed[..., 1, 7:].all() and changed[..., 7:].any()
 
 
@@ -179,7 +195,8 @@ def test_rows_that_begin_again_have_no_past(family: str, scene: Callable) -> Non
     model.config = replace(model.config, horizon=6) if hasattr(model.config, "horizon") else model.config
     env = TransformedEnv(TrafficEnv(scenes, episode, num_scenes=2, num_rollouts=2), TokenAction(model.tokenizer))
     actor = MotionActor(model, Contexts(scenes, model.featurize, episode), num_rollouts=2)
-    with torch.no_grad():
+    # Agents that take turns see what those before them chose, which two rollouts draw otherwise.
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         state = env.reset()
         for _ in range(3):
             state = env.step(actor(state))["next"].exclude("reward")
@@ -189,6 +206,30 @@ def test_rows_that_begin_again_have_no_past(family: str, scene: Callable) -> Non
         fresh = MotionActor(model, Contexts(scenes, model.featurize, episode), num_rollouts=2)
         expected = fresh.decide(env.reset())[0].logits
     torch.testing.assert_close(logits[0, :3], expected[0, :3], atol=1e-5, rtol=0)
+
+
+@families
+def test_rows_may_stand_at_different_decisions_of_scenes_of_different_size(family: str, scene: Callable) -> None:
+    model, scenes = make(family), [scene(4, seed=1), scene(2, seed=2), scene(6, seed=3)]
+    env = TrafficEnv(scenes, num_scenes=2, num_rollouts=2, num_agents=6)
+    env = TransformedEnv(env, TokenAction(model.tokenizer))
+    actor = MotionActor(model, Contexts(scenes, model.featurize), num_rollouts=2)
+    state, steps = env.reset(), []
+    # At 3 a row starts again; a group moves on at 6, from two agents to six, and at 9, to four.
+    resets = {3: [True, False, False, False], 6: [False, False, True, True], 9: [False, False, True, True]}
+    for step in range(12):
+        if step in resets:
+            state = env.reset(state.set("_reset", torch.tensor(resets[step])[:, None])).exclude("_reset")
+        steps.append(env.step(actor(state)))
+        state = steps[-1]["next"].exclude("reward", keys.REWARD)
+    rolled = torch.stack(steps, 1)
+    assert rolled[keys.SCENE][2:, ::3].tolist() == [[1, 1, 2, 0]] * 2
+    for row, first, last in ((0, 0, 3), (0, 3, 12), (1, 0, 12), (2, 0, 6), (2, 6, 9), (3, 9, 12)):
+        part = rolled[row : row + 1, first:last]
+        played, controlled = [scenes[int(part[keys.SCENE][0, 0])]], part[keys.CONTROLLED].transpose(1, 2)
+        expected = forced(model, played, EpisodeOptions(), part)
+        written = part[keys.LOG_PROB].transpose(1, 2)
+        torch.testing.assert_close(written[controlled], expected[controlled], atol=1e-5, rtol=0)
 
 
 def test_every_family_is_tested() -> None:
