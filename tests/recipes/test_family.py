@@ -1,4 +1,4 @@
-"""A policy family of one's own, as docs/how-to.md has it, goes through everything that a recipe does."""
+"""A policy family of one's own, as docs/how-to.md has it, goes through everything that a recipe does; so do others."""
 
 from __future__ import annotations
 
@@ -39,17 +39,23 @@ def habit(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     del FAMILIES["habit"]
 
 
-@pytest.fixture(scope="module")
-def trained(habit: str, run: Callable, options: Callable, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("habit")
-    outcome = run("pretrain", *options("pretrain", "model=habit", habit, f"output={folder}"))
+@pytest.fixture(scope="module", params=["habit", "trajeglish_nano"])
+def trained(
+    request: pytest.FixtureRequest,
+    habit: str,
+    run: Callable,
+    options: Callable,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Path:
+    folder = tmp_path_factory.mktemp(request.param)
+    outcome = run("pretrain", *options("pretrain", f"model={request.param}", habit, f"output={folder}"))
     assert outcome.status == 0, outcome.err
     return folder / "policy.pt"
 
 
 def test_it_is_opened_by_its_file_alone(trained: Path) -> None:
     model, episode, config = open_policy(trained)
-    assert config["family"] == "habit" and episode.horizon == model.config.horizon == 16
+    assert trained.parent.name.startswith(config["family"]) and episode.horizon == model.config.horizon == 16
     assert isinstance(model, MotionModel)
 
 
@@ -69,7 +75,14 @@ def test_what_it_decides_step_by_step_is_what_it_thinks_of_the_whole(trained: Pa
     torch.testing.assert_close(written[controlled], expected[controlled], atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("method", ["dpa_omf", "sft_best_oa", "rloo", "cat_k"])
+@pytest.mark.parametrize(
+    ("trained", "method"),
+    [
+        *(("habit", method) for method in ("dpa_omf", "sft_best_oa", "rloo", "cat_k")),
+        *(("trajeglish_nano", method) for method in ("dpa_omf", "rloo", "cat_k")),
+    ],
+    indirect=["trained"],
+)
 def test_it_is_collected_aligned_and_evaluated(
     trained: Path, habit: str, run: Callable, options: Callable, tmp_path: Path, method: str
 ) -> None:
