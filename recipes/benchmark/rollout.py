@@ -25,7 +25,8 @@ from torch.utils.flop_counter import FlopCounterMode
 from torchrl.envs import TransformedEnv
 
 from dpa.losses import NextTokenLoss, token_network
-from dpa.models import Contexts, Decoding, MotionActor, MotionModel, collate_contexts, make_context
+from dpa.models import Contexts, Decision, Decoding, MotionActor, MotionModel, collate_contexts, make_context
+from dpa.models.actor import Chooser
 from dpa.models.context import pad_context
 from dpa.ranking.transform import RankRollouts
 from dpa.rollout import RolloutTask, RolloutWorker
@@ -91,22 +92,30 @@ class UncachedActor(MotionActor):
         """Rows that share an encoded scene."""
         return self.num_rollouts
 
-    def logits(self, tensordict: TensorDictBase) -> Tensor:
-        """``[B, A, V]`` of the decision at hand; all rows stand at the same one."""
+    def decide(self, tensordict: TensorDictBase) -> tuple[Decision, Chooser]:
+        """Take the decision at hand, all agents at once."""
+        logits = self._logits(tensordict).float()
+        chooser = self.chooser(tensordict)
+        decision = Decision(chooser(logits), logits)
+        self._last = decision.token
+        return decision, chooser
+
+    def _logits(self, tensordict: TensorDictBase) -> Tensor:
+        """``[B, A, P]``; all rows stand at the same decision."""
         step, scene = int(tensordict[keys.STEP][0, 0]), tensordict[keys.SCENE]
         if step == 0:
             self._start(tensordict, [0] * len(scene))
-            self._taken = torch.zeros(*tensordict[keys.VALID].shape, self.model.config.horizon, dtype=torch.int64)
-            self._taken = self._taken.to(scene.device)
+            tokenizer, shape = self.model.tokenizer, (*tensordict[keys.VALID].shape, self.model.config.horizon)
+            self._taken = torch.zeros(*shape, *tokenizer.shape, dtype=tokenizer.dtype, device=scene.device)
         else:
-            self._taken[..., step - 1] = self._last
+            self._taken[:, :, step - 1] = self._last
         rows = scene[:: self.sharing].tolist()
         context = pad_context(collate_contexts([self.contexts[i] for i in rows]), self._taken.shape[1]).to(scene.device)
         steps = self.model.tokenizer.steps * (step + 1)
         context, episode = context.clone(recurse=False), context.episode.clone(recurse=False)
         episode.logged, episode.logged_valid = episode.logged[:, :, :steps], episode.logged_valid[:, :, :steps]
         context.episode = episode
-        tokens = self._taken[..., : step + 1].unflatten(0, (len(rows), -1))
+        tokens = self._taken[:, :, : step + 1].unflatten(0, (len(rows), -1))
         valid = episode.controlled[:, None, :, None].expand(-1, 1, -1, step + 1)
         return self.model(context, tokens, valid)[..., -1, :].flatten(0, 1)
 

@@ -18,7 +18,7 @@ from dpa.models.trajeglish.context import TrajeglishContext, featurize, order_of
 from dpa.models.trajeglish.decoder import Cast, TurnDecoder
 from dpa.models.trajeglish.memory import TurnMemory
 from dpa.models.vicinity import NEAREST_PIECES
-from dpa.tokens.base import MotionTokenizer
+from dpa.tokens.base import MotionTokenizer, check_vocabulary
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Trajeglish(MotionModel):
         context: how scenes are cut up.
 
     Raises:
-        ValueError: a name that is no size.
+        ValueError: a name that is no size, or a tokenizer without a vocabulary.
 
     Examples:
         >>> from dpa.models.context import collate_contexts, make_context
@@ -82,7 +82,7 @@ class Trajeglish(MotionModel):
         self, config: TrajeglishConfig | str, tokenizer: MotionTokenizer, context: ContextOptions | None = None
     ) -> None:
         super().__init__()
-        config = named_size(config, SIZES)
+        config, tokenizer = named_size(config, SIZES), check_vocabulary(tokenizer, "Trajeglish")
         self.config, self.tokenizer, self.context = config, tokenizer, context or ContextOptions()
         size = (config.width, config.heads, config.feed)
         self.encoder = SceneEncoder(*size, config.encoder_layers, config.dropout)

@@ -13,7 +13,16 @@ from scipy import stats
 from torch import Tensor
 
 from dpa.models import Decoding
-from dpa.models.behaviorgpt.mixture import CONCENTRATION, UNIT, Mixture, PatchMixture, _changes, _log_bessel, _mises, _poses
+from dpa.models.behaviorgpt.mixture import (
+    CONCENTRATION,
+    UNIT,
+    Mixture,
+    PatchMixture,
+    _changes,
+    _log_bessel,
+    _mises,
+    _poses,
+)
 from dpa.models.registry import build_model, size_of
 from dpa.tokens import PatchTokenizer, VerletTokenizer
 
@@ -146,10 +155,11 @@ def test_sizes_have_the_parameters_that_they_are_named_for(size: str, published:
 
 
 def test_a_vocabulary_is_refused_and_so_are_patches_elsewhere() -> None:
-    for family, size, tokenizer in (("behaviorgpt", "nano", VerletTokenizer()), ("smart", "nano", PatchTokenizer()),
-                                    ("motionlm", "nano", PatchTokenizer())):  # fmt: skip
+    patches = PatchTokenizer()
+    refused = {"behaviorgpt": VerletTokenizer(), "motionlm": patches, "smart": patches, "trajeglish": patches}
+    for family, tokenizer in refused.items():
         with pytest.raises(ValueError, match=r"tokenizer"):
-            build_model({"family": family, "model": size_of(family, size), "context": {}}, tokenizer)
+            build_model({"family": family, "model": size_of(family, "nano"), "context": {}}, tokenizer)
 
 
 if __name__ == "__main__":
