@@ -97,7 +97,7 @@ class TrafficEnv(EnvBase):
         self._signals = Signals(signals, num_rollouts, self.device) if signals else None
         self._cursor = 0
         self._generator = torch.Generator()
-        self._scene = torch.full((num_scenes,), -1)
+        self._scene = torch.full((num_scenes,), -1)  # stays on the host, which loads the scenes
         self._make_specs()
 
     def _make_specs(self) -> None:
@@ -160,6 +160,7 @@ class TrafficEnv(EnvBase):
         else:
             drawn = torch.randint(len(self.scenes), (int(groups.sum()),), generator=self._generator)
         self._scene[groups] = drawn
+        self._scene_there = self._repeat(self._scene.to(self.device))
         scenes = [self._padded(index) for index in self._scene.tolist()]
         batch = collate(scenes).to(self.device)
         each = self._repeat
@@ -229,7 +230,7 @@ class TrafficEnv(EnvBase):
     def _observe(self) -> TensorDict:
         return TensorDict(
             {
-                keys.SCENE: self._repeat(self._scene.to(self.device)),
+                keys.SCENE: self._scene_there,
                 keys.STEP: self._step_count,
                 keys.AGENTS: TensorDict(
                     {
@@ -239,6 +240,7 @@ class TrafficEnv(EnvBase):
                         "kind": self._kind,
                     },
                     batch_size=(*self.batch_size, self.num_agents),
+                    device=self.device,  # without it, TensorDict moves what is there already and waits for the device
                 ),
             },
             batch_size=self.batch_size,
