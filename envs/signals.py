@@ -17,6 +17,7 @@ from torch import Tensor
 from torchrl.data import Categorical, TensorSpec, Unbounded
 
 from envs import keys
+from envs.devices import of_rows
 from envs.geometry.boxes import nearest_box_distance
 from envs.geometry.edges import RoadEdges
 from envs.geometry.ground import Ground, climb
@@ -39,16 +40,15 @@ class SignalMap:
     @cached_property
     def edges(self) -> RoadEdges:
         """Road edges; every ring is closed."""
-        lines = [line.to(self._device) for line in polylines(self._scene, EDGE_KINDS)]
         try:
-            return RoadEdges.from_polylines(lines, every_ring=True)
+            return RoadEdges.from_polylines(polylines(self._scene, EDGE_KINDS), every_ring=True).to(self._device)
         except ValueError as error:
             raise ValueError(f"scene {self._scene.scene_id}: {error}") from error
 
     @cached_property
     def ground(self) -> Ground:
         """Heights of the map."""
-        return Ground(self._scene.road.points)
+        return Ground(self._scene.road.points.to(self._device))
 
     @cached_property
     def lanes(self) -> Lanes | None:
@@ -154,16 +154,15 @@ def collision(decision: Decision) -> Tensor:
 @signal("offroad", dtype=torch.bool, lifted=True)
 def offroad(decision: Decision) -> Tensor:
     """A corner of the agent's box is off the road in some pose (realism.md section 4.1)."""
-    off = torch.zeros_like(decision.valid[..., 1:])
+    off = []
     position = torch.cat((decision.poses[..., :2], decision.height[..., None]), -1)[..., 1:, :]
     heading = decision.poses[..., 1:, 2]
     for scene, road in enumerate(decision.maps):
-        there = decision.valid[scene, ..., 1:]
-        if there.any():
-            extent = decision.agents.extent[scene, None, :, None].expand(position[scene].shape)
-            boxes = (position[scene][there], heading[scene][there], extent[there])
-            off[scene][there] = road.edges.box_offroad_distance(*boxes) > 0
-    return off.any(-1)
+        extent = decision.agents.extent[scene, None, :, None].expand(position[scene].shape)
+        boxes = (position[scene], heading[scene], extent)
+        distance = of_rows(decision.valid[scene, ..., 1:], road.edges.box_offroad_distance, *boxes)
+        off.append(distance > 0)
+    return torch.stack(off).any(-1)
 
 
 @signal("progress", dtype=torch.float32)
@@ -171,11 +170,12 @@ def progress(decision: Decision) -> Tensor:
     """Metres that the agent advanced along its own logged path, from the nearest place on it to the next one."""
     path, valid = decision.agents.position[:, None, :, :, :2], decision.agents.valid[:, None]
     # A dim for the two places between that of the agents and that of the path.
-    places = decision.poses[..., [0, -1], :2]
+    poses, here = decision.poses[..., :2], decision.valid
+    places = torch.stack((poses[..., 0, :], poses[..., -1, :]), -2)
     shape = (*places.shape[:-1], path.shape[-2])
     path, valid = path[..., None, :, :].expand(*shape, 2), valid[..., None, :].expand(shape)
     before, after = distance_along(path, valid, places).unbind(-1)
-    return torch.where(decision.valid[..., [0, -1]].all(-1), after - before, 0)
+    return torch.where(here[..., 0] & here[..., -1], after - before, 0)
 
 
 @signal("red_light", dtype=torch.bool)
@@ -229,14 +229,23 @@ class Signals:
         """What signals say at a reset: 0, ``[B, A]``."""
         return {name: torch.zeros(shape, dtype=each.dtype, device=self._device) for name, each in self._signals.items()}
 
-    def load(self, index: Sequence[int], scenes: Sequence[Scene], batch: Scene) -> None:
-        """Take over the S scenes at hand: their indices in the source, uncollated on the CPU, and collated."""
+    def load(self, index: Sequence[int], scenes: Sequence[Scene], batch: Scene, controlled: Sequence[Tensor]) -> None:
+        """Take over the S scenes at hand.
+
+        Args:
+            index: of each in the source.
+            scenes: uncollated, on the CPU.
+            batch: collated, on the device.
+            controlled: ``[A]`` bool of each, on the CPU: whose height is that of the ground.
+        """
         made = self._maps
         self._maps = {
             i: made[i] if i in made else SignalMap(scene, self._device) for i, scene in zip(index, scenes, strict=True)
         }
         self._index, self._agents = list(index), batch.agents
         if self._lifted:
+            # Rows and not a mask, which would have to be counted on the device in every decision.
+            self._moved = [mask.nonzero()[:, 0].to(self._device) for mask in controlled]
             self._start_heights()
 
     def _start_heights(self) -> None:
@@ -257,19 +266,16 @@ class Signals:
             again = rows.view(-1, self._num_rollouts, 1)
             self._height = torch.where(again, self._first, self._height)
 
-    def measure(self, poses: Tensor, valid: Tensor, controlled: Tensor, step: Tensor) -> dict[str, Tensor]:
+    def measure(self, poses: Tensor, valid: Tensor, step: Tensor) -> dict[str, Tensor]:
         """All signals of one decision, each ``[B, A]``.
 
         Args:
             poses: ``[B, A, F + 1, 3]``, the pose before the decision first.
             valid: ``[B, A, F + 1]`` bool.
-            controlled: ``[B, A]`` bool.
             step: ``[B]`` int64, logged step of the pose before.
         """
-        poses, valid, controlled, step = (
-            value.unflatten(0, (-1, self._num_rollouts)) for value in (poses, valid, controlled, step)
-        )
-        height = self._heights(poses, controlled, step) if self._lifted else None
+        poses, valid, step = (value.unflatten(0, (-1, self._num_rollouts)) for value in (poses, valid, step))
+        height = self._heights(poses, step) if self._lifted else None
         maps = [self._maps[index] for index in self._index]
         decision = Decision(poses, valid, height, step, self._agents, maps)
         there = valid[..., 1:].any(-1)
@@ -278,17 +284,16 @@ class Signals:
             for name, each in self._signals.items()
         }
 
-    def _heights(self, poses: Tensor, controlled: Tensor, step: Tensor) -> Tensor:
+    def _heights(self, poses: Tensor, step: Tensor) -> Tensor:
         """``[S, K, A, F + 1]``: of the ground under controlled agents, of the log for the others."""
         steps = poses.shape[-2] - 1
         at = step[..., None] + torch.arange(steps + 1, device=step.device)
         logged = self._agents.position[..., 2].transpose(1, 2)  # [S, L, A]
         scene = torch.arange(len(step), device=step.device)[:, None, None]
         height = logged[scene, at].transpose(-1, -2).contiguous()
-        for row, index in enumerate(self._index):
-            moved = controlled[row]
-            start = self._height[row][moved]
-            rise = climb(self._maps[index].ground, poses[row][moved][:, 1:], start, start - self._above[row][moved])
-            height[row][moved] = start[:, None] + torch.nn.functional.pad(rise, (1, 0))
+        for row, (index, moved) in enumerate(zip(self._index, self._moved, strict=True)):
+            start, above = self._height[row][:, moved], self._above[row][:, moved]
+            rise = climb(self._maps[index].ground, poses[row][:, moved, 1:], start, start - above)
+            height[row][:, moved] = start[..., None] + torch.nn.functional.pad(rise, (1, 0))
         self._height = height[..., -1]
         return height

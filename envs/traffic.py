@@ -174,9 +174,10 @@ class TrafficEnv(EnvBase):
         )
         self._present = each(agents.present)
         self._kind = each(agents.kind)
-        self._controlled = each(torch.stack([self.episode.choose(scene) for scene in scenes]).to(self.device))
+        controlled = torch.stack([self.episode.choose(scene) for scene in scenes])
+        self._controlled = each(controlled.to(self.device))
         if self._signals is not None:
-            self._signals.load(self._scene.tolist(), scenes, batch)
+            self._signals.load(self._scene.tolist(), scenes, batch, controlled)
         if fresh:
             self._recent = self._start.clone()
             self._step_count = torch.zeros(*self.batch_size, 1, dtype=torch.int64, device=self.device)
@@ -215,7 +216,7 @@ class TrafficEnv(EnvBase):
         if before is not None:
             later = torch.where(self._controlled[..., None], self._present[..., None], log_valid)
             valid, first = torch.cat((before[..., None], later), -1), CURRENT_STEP + index * self.episode.decision_steps
-            out[keys.AGENTS].update(self._signals.measure(self._recent, valid, self._controlled, first))
+            out[keys.AGENTS].update(self._signals.measure(self._recent, valid, first))
         out[keys.REWARD] = reward[..., None]
         out[keys.DONE], out[keys.TRUNCATED], out[keys.TERMINATED] = done, done.clone(), torch.zeros_like(done)
         return out

@@ -7,11 +7,17 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, Protocol
 
 import torch
-from scipy.stats import rankdata
 from torch import Tensor
 
 from dpa.ranking.displacement import average_displacement
-from dpa.ranking.features import feature_clips, feature_names, feature_weights, log_trajectory, occupancy_features
+from dpa.ranking.features import (
+    feature_clips,
+    feature_names,
+    feature_weights,
+    log_trajectory,
+    logged_steps,
+    occupancy_features,
+)
 from dpa.ranking.transport import Transport, deciding_options, make_solver, transport_cost
 from dpa.ranking.transport.problems import step_cost
 from envs.scene import CURRENT_STEP, STEP_SECONDS, Scene
@@ -21,7 +27,7 @@ AGGREGATES: dict[str, Callable[[Tensor], Tensor]] = {
     "mean": lambda distance: distance.mean(-1),
     "median": lambda distance: distance.quantile(0.5, dim=-1),
     "max": lambda distance: distance.amax(-1),
-    "mean_rank": lambda distance: torch.from_numpy(rankdata(distance.cpu().numpy(), axis=0)).float().mean(-1),
+    "mean_rank": lambda distance: _ranks(distance).mean(-1),
 }
 """From the ranked agents' distances ``[R, E]`` to the scene's ``[R]``.
 
@@ -73,16 +79,20 @@ class Coupled(NamedTuple):
 
 
 class Distance(Protocol):
-    """How rollouts of a scene are compared with its log: :class:`PreferenceDistance`, or a function of your own."""
+    """How rollouts of a scene are compared with its log: :class:`PreferenceDistance`, or a function of your own.
+
+    One that has a true attribute ``on_device`` is given trajectories where they were rolled out; any other gets them on
+    the CPU.
+    """
 
     def __call__(self, scene: Scene, trajectories: Tensor, controlled: Tensor, /) -> Ranking:
         """Rank rollouts of one scene.
 
         Args:
-            scene: an uncollated scene.
+            scene: an uncollated scene, on the CPU.
             trajectories: ``[R, A, T, 4]`` x, y, z, heading at 10 Hz after the current step, of the present agents in
                 order.
-            controlled: ``[A]`` bool.
+            controlled: ``[A]`` bool, on the CPU.
 
         Returns:
             the ranking; D is the same for all scenes and may be 0.
@@ -157,6 +167,11 @@ class PreferenceDistance:
         make_solver(self.method, **self.solver)
         check_options(self, aggregate=AGGREGATES, agents=AGENTS)
 
+    @property
+    def on_device(self) -> bool:
+        """Features and transport are computed where trajectories are; exact solvers would bring the features back."""
+        return make_solver(self.method, **self.solver).on_device
+
     def describe(self) -> dict[str, Any]:
         """The options that decide a ranking, with defaults filled in, ready for JSON."""
         names = feature_names(self.features)
@@ -175,26 +190,28 @@ class PreferenceDistance:
         """Rank rollouts of one scene.
 
         Args:
-            scene: an uncollated scene.
+            scene: an uncollated scene, on the CPU.
             trajectories: ``[R, A, T, 4]`` x, y, z, heading at 10 Hz after the current step, of the present agents in
-                order.
-            controlled: ``[A]`` bool; all of them by default.
+                order; the ranking is on their device.
+            controlled: ``[A]`` bool, on the CPU; all of them by default.
         """
-        ego = ranked_agents(scene, controlled, self.agents)
-        coupled = self.couple(scene, trajectories, ego, coupling=False)
-        logged, moved = coupled.valid.any(-1), coupled.moved
-
-        ego = ego[logged]
-        agent_distance = trajectories.new_zeros(trajectories.shape[:2])
-        agent_distance[:, ego] = moved.distance[:, logged]
+        ego, steps, there = ranked_agents(scene, controlled, self.agents), trajectories.shape[2], trajectories.device
+        moved = self.couple(scene, trajectories, ego, coupling=False).moved
+        # Who has a logged step is known on the CPU, from the scene; a device only gets their rows.
+        logged = logged_steps(scene, steps, self.features, ego=ego, stride=self.stride).any(-1)
+        found, ego = logged.nonzero()[:, 0].to(there), ego[logged]
         agent_ranked = torch.zeros(trajectories.shape[1], dtype=torch.bool)
         agent_ranked[ego] = True
+        log_valid = scene.agents.valid[scene.agents.present][ego, CURRENT_STEP + 1 : CURRENT_STEP + 1 + steps]
+        log, ego = log_trajectory(scene, steps)[ego].to(trajectories), ego.to(there)
+
+        agent_distance = trajectories.new_zeros(trajectories.shape[:2])
+        agent_distance[:, ego] = moved.distance[:, found]
+        agent_ranked = agent_ranked.to(there)
         if len(ego) == 0:
             nothing = trajectories.new_zeros(len(trajectories))
             return Ranking(nothing, agent_distance, nothing, agent_ranked, _shares(moved.parts))
-        steps = trajectories.shape[2]
-        log_valid = scene.agents.valid[scene.agents.present][ego, CURRENT_STEP + 1 : CURRENT_STEP + 1 + steps]
-        ade = average_displacement(trajectories[:, ego], log_trajectory(scene, steps)[ego], log_valid).scene
+        ade = average_displacement(trajectories[:, ego], log, log_valid.to(there)).scene
         distance = AGGREGATES[self.aggregate](agent_distance[:, ego])
         return Ranking(distance, agent_distance, ade, agent_ranked, _shares(moved.parts))
 
@@ -204,9 +221,9 @@ class PreferenceDistance:
         """Transport agents of rollouts onto their log.
 
         Args:
-            scene: an uncollated scene.
+            scene: an uncollated scene, on the CPU.
             trajectories: ``[R, A, T, 4]`` as for a ranking.
-            ego: ``[E]`` int64, rows of the agents.
+            ego: ``[E]`` int64, rows of the agents, on the CPU.
             coupling: keep the couplings, not their cost alone.
             stride: steps of 0.1 s between two measurements; by default that of the distance.
 
@@ -263,6 +280,15 @@ def ranked_agents(scene: Scene, controlled: Tensor | None, agents: str) -> Tenso
     if controlled is None:
         controlled = torch.ones(int(present.sum()), dtype=torch.bool)
     return (controlled & scene.agents.evaluated[present] if agents == "evaluated" else controlled).nonzero()[:, 0]
+
+
+def _ranks(distance: Tensor) -> Tensor:
+    """Rank of each rollout in the eyes of each agent, 1 for the nearest, ties at their mean: ``[R, E]`` -> ``[R, E]``.
+
+    Every pair is compared, which keeps the work where the distances are.
+    """
+    mine, others = distance[:, None], distance[None]
+    return (others < mine).sum(1) + ((others == mine).sum(1) + 1) / 2
 
 
 def _shares(parts: Tensor) -> Tensor:

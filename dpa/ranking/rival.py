@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -39,6 +39,8 @@ class DisplacementDistance:
         (tensor([3., 0.]), torch.Size([2, 0]))
     """
 
+    on_device: ClassVar[bool] = True
+
     measure: Literal["average", "final"] = "average"
     aggregate: str = "mean"
     agents: Literal["controlled", "evaluated"] = "controlled"
@@ -52,12 +54,14 @@ class DisplacementDistance:
 
     def __call__(self, scene: Scene, trajectories: Tensor, controlled: Tensor | None = None) -> Ranking:
         """Rank rollouts of one scene (arguments of :meth:`~dpa.ranking.PreferenceDistance.__call__`)."""
-        ego, steps = ranked_agents(scene, controlled, self.agents), trajectories.shape[2]
+        ego, steps, there = ranked_agents(scene, controlled, self.agents), trajectories.shape[2], trajectories.device
         valid = scene.agents.valid[scene.agents.present][:, CURRENT_STEP + 1 : CURRENT_STEP + 1 + steps]
         ego = ego[valid[ego].any(-1)]
         ranked = torch.zeros(trajectories.shape[1], dtype=torch.bool)
         ranked[ego] = True
-        sides = trajectories[:, ego], log_trajectory(scene, steps)[ego].to(trajectories), valid[ego]
+        log, valid = log_trajectory(scene, steps)[ego].to(trajectories), valid[ego].to(there)
+        ego, ranked = ego.to(there), ranked.to(there)
+        sides = trajectories[:, ego], log, valid
         moved = MEASURES[self.measure](*sides)
         agent_distance = trajectories.new_zeros(trajectories.shape[:2])
         agent_distance[:, ego] = moved.agent

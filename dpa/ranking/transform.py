@@ -37,7 +37,8 @@ class RankRollouts(Transform):
 
     Made for a collector's ``postproc``: it runs once, on complete episodes, and what it returns is small enough to keep
     (tokens and numbers; poses follow from tokens). Never append it to a replay buffer, which would rank anew at every
-    sample.
+    sample. Rollouts on a device come to the CPU at once, before anything is computed; poses stay there for a distance
+    that ranks on the device (``on_device``).
 
     Reads ``scene`` and ``step`` ``[B, T]``, and under ``agents`` ``token`` and ``controlled`` ``[B, T, A]`` and
     ``("next", ..., "recent")`` ``[B, T, A, F + 1, 3]``. Writes a tensordict of batch size ``[S]`` with the keys of
@@ -82,11 +83,12 @@ class RankRollouts(Transform):
         if num_rollouts < 1:
             raise ValueError(f"num_rollouts must be 1 or more, got {num_rollouts}.")
         self.scenes, self.num_rollouts, self.distance = scenes, num_rollouts, distance
+        self.on_device = getattr(distance, "on_device", False)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Rank every group: ``[S * K, T]`` -> ``[S]``."""
         scene, controlled, tokens, poses = self._groups(tensordict)
-        ranked = [self._rank(*group) for group in zip(scene.tolist(), poses.cpu(), controlled.cpu(), strict=True)]
+        ranked = [self._rank(*group) for group in zip(scene.tolist(), poses, controlled, strict=True)]
         return TensorDict(
             {
                 keys.SCENE: scene,
@@ -120,12 +122,19 @@ class RankRollouts(Transform):
         }
 
     def _groups(self, rollouts: TensorDictBase) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Scene ``[S]``, controlled ``[S, A]``, tokens ``[S, K, A, T, ...]`` and poses ``[S, K, A, T * F, 3]``."""
-        rollouts = self._check_episodes(rollouts)
-        scene = self._alike(rollouts[keys.SCENE], "scenes")
-        controlled = self._alike(rollouts[keys.CONTROLLED], "controlled agents")
-        tokens = rollouts[keys.TOKEN].transpose(2, 3)
-        decisions = rollouts["next", *keys.RECENT][..., 1:, :]  # the first pose repeats the last one of the step before
+        """Scene ``[S]``, controlled ``[S, A]``, tokens ``[S, K, A, T, ...]`` and poses ``[S, K, A, T * F, 3]``.
+
+        All but the tokens are on the CPU, where scenes are, and so are poses unless the distance ranks on the device.
+        """
+        recent = ("next", *keys.RECENT)
+        # All that comes back from the device comes here, at once.
+        here = rollouts.select(keys.SCENE, keys.STEP, keys.CONTROLLED, *(() if self.on_device else (recent,))).cpu()
+        groups = self._check_episodes(here)
+        scene = self._alike(groups[keys.SCENE], "scenes")
+        controlled = self._alike(groups[keys.CONTROLLED], "controlled agents")
+        tokens = rollouts[keys.TOKEN].unflatten(0, (-1, self.num_rollouts)).transpose(2, 3)
+        poses = (rollouts if self.on_device else here)[recent].unflatten(0, (-1, self.num_rollouts))
+        decisions = poses[..., 1:, :]  # the first pose repeats the last one of the step before
         return scene, controlled, tokens, decisions.movedim(2, 3).flatten(3, 4)
 
     def _check_episodes(self, rollouts: TensorDictBase) -> TensorDictBase:

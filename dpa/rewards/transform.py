@@ -39,6 +39,7 @@ class RewardRollouts(RankRollouts):
         rewards: Mapping[str, Reward] | None = None,
     ) -> None:
         super().__init__(scenes, num_rollouts, distance)
+        self.on_device = False  # rewards are measured beside the scenes, on the CPU
         self.rewards = dict(rewards or {})
         self.in_keys = [*self.in_keys, keys.SAMPLING_LOG_PROB]
         self.out_keys += [keys.SAMPLE_LOG_PROB, keys.SPREAD, *((keys.REWARDS, name) for name in self.rewards)]

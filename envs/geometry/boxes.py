@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from envs.devices import on_host
 from envs.geometry.frames import rotate
 
 CORNER_ROUNDING = 0.7
@@ -21,6 +22,8 @@ _CIRCLES_PER_CHUNK = 1 << 17
 """Pairs of circles compared together: small enough for the working set to stay in a core's cache."""
 _BOXES_PER_CHUNK = 1 << 14
 """Pairs of boxes measured together, for the same reason."""
+_PAIRS_ON_DEVICE = 1 << 22
+"""Pairs of boxes measured together on a device: some hundred MB."""
 _BOUND_MARGIN = 1e-3
 """Room for float32 rounding when a pair is ruled out by its circles [m]."""
 
@@ -38,8 +41,11 @@ def box_corners(box: Tensor) -> Tensor:
         >>> box_corners(torch.tensor([1.0, 0.0, 0.0, 4.0, 2.0]))[0]
         tensor([3., 1.])
     """
-    unit = torch.tensor(_CORNERS, dtype=box.dtype, device=box.device)
-    return box[..., None, :2] + rotate(unit * box[..., None, 3:5], box[..., None, 2])
+    front, left = (box[..., 3:5] / 2).unbind(-1)
+    corners = torch.stack(
+        (torch.stack((front, -front, -front, front), -1), torch.stack((left, left, -left, -left), -1)), -1
+    )
+    return box[..., None, :2] + rotate(corners, box[..., None, 2])
 
 
 def signed_box_distance(first: Tensor, second: Tensor, rounding: float = CORNER_ROUNDING) -> Tensor:
@@ -85,7 +91,8 @@ def nearest_box_distance(
     """Signed distance from each ego box to the nearest other box of its scene.
 
     Exact, yet nearly all pairs are only looked at through their circles: a pair can be the nearest one only if its
-    circumscribed circles come closer than the inscribed circles of every other pair do.
+    circumscribed circles come closer than the inscribed circles of every other pair do. A device measures all
+    pairs, for it would have to be waited for to hear which ones are left.
 
     Args:
         boxes: ``[..., A, 5]``, x, y, heading, length, width.
@@ -108,6 +115,8 @@ def nearest_box_distance(
         )
     ego = torch.arange(num_agents, device=boxes.device) if ego is None else ego
     flat, flat_valid = boxes.reshape(-1, num_agents, 5), valid.reshape(-1, num_agents)
+    if not on_host(boxes):
+        return _of_all_pairs(flat, flat_valid, ego, rounding).view(*boxes.shape[:-2], len(ego))
     ego_row, other = _candidates(flat, flat_valid, ego, rounding)
     flat = flat.reshape(-1, 5)
     nearest = boxes.new_full((len(flat_valid) * len(ego),), NOBODY)
@@ -116,6 +125,18 @@ def nearest_box_distance(
         distance = signed_box_distance(flat.index_select(0, first), flat.index_select(0, second), rounding)
         nearest.scatter_reduce_(0, row, distance, "amin")
     return nearest.view(*boxes.shape[:-2], len(ego))
+
+
+def _of_all_pairs(boxes: Tensor, valid: Tensor, ego: Tensor, rounding: float) -> Tensor:
+    """Distance to the nearest other box, ``[M, A, 5]`` boxes -> ``[M, E]``, from every pair."""
+    itself = ego[:, None] == torch.arange(boxes.shape[1], device=ego.device)
+    rows = max(1, _PAIRS_ON_DEVICE // max(1, itself.numel()))
+    nearest = [boxes.new_empty(0, len(ego))]
+    for some, there in zip(boxes.split(rows), valid.split(rows), strict=True):
+        apart = signed_box_distance(some[:, ego, None], some[:, None], rounding)
+        pair = there[:, ego, None] & there[:, None] & ~itself
+        nearest.append(torch.where(pair, apart, NOBODY).amin(-1))
+    return torch.cat(nearest)
 
 
 def _candidates(boxes: Tensor, valid: Tensor, ego: Tensor, rounding: float) -> tuple[Tensor, Tensor]:

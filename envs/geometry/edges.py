@@ -8,13 +8,14 @@ is the distance in the plane, positive on the right of the edge, which is off th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from envs.devices import on_host, require
 from envs.geometry.boxes import box_corners
 from envs.geometry.ragged import Ragged
 
@@ -29,6 +30,8 @@ _MARGIN = 1e-6
 """Room for float32 rounding when a segment is ruled out for a cell, as a part of the largest coordinate."""
 _TINY = torch.finfo(torch.float32).tiny
 _NO_SEGMENT = -1
+_PAIRS_ON_DEVICE = 1 << 25
+"""Pairs of a query and a segment that are looked at together on a device, a dozen numbers each."""
 
 
 @dataclass(frozen=True)
@@ -87,10 +90,11 @@ class RoadEdges:
         longest = max(map(len, lines))
         previous, following = [], []
         first = 0
-        for line in lines:
+        gaps = torch.stack([line[0] - line[-1] for line in lines]).cpu()
+        for line, gap in zip(lines, gaps, strict=True):
             last = first + len(line) - 2
             before, after = torch.arange(first - 1, last), torch.arange(first + 1, last + 2)
-            ring = (every_ring or len(line) == longest) and float((line[0] - line[-1]).square().sum()) < CYCLE_GAP**2
+            ring = (every_ring or len(line) == longest) and float(gap.square().sum()) < CYCLE_GAP**2
             before[0], after[-1] = (last, first) if ring else (_NO_SEGMENT, _NO_SEGMENT)
             previous.append(before)
             following.append(after)
@@ -104,6 +108,13 @@ class RoadEdges:
             line=torch.arange(len(lines)).repeat_interleave(torch.tensor([len(line) - 1 for line in lines])).to(device),
             height_stretch=height_stretch,
             points_at_zero=points_at_zero,
+        )
+
+    def to(self, device: torch.device | str) -> RoadEdges:
+        """The same on a device."""
+        return replace(
+            self,
+            **{name: getattr(self, name).to(device) for name in ("start", "delta", "previous", "following", "line")},
         )
 
     def signed_distance(self, points: Tensor) -> Tensor:
@@ -169,14 +180,18 @@ class RoadEdges:
             tensor(0.5000)
         """
         boxes = torch.cat((position, heading[..., None], extent.expand(position.shape)), -1).reshape(-1, 7)
+        if not on_host(boxes):
+            return self._of_boxes(boxes).view(position.shape[:-1])
         # Half of all agents stand, and a box that repeats the one before it has the same distance.
         new = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
         new[1:] = (boxes[1:] != boxes[:-1]).any(-1)
-        moved = boxes[new]
-        corners = box_corners(moved[:, [0, 1, 3, 4, 5]])
-        bottom = (moved[:, 2] - moved[:, 6] / 2)[:, None, None].expand(-1, 4, 1)
-        distance = self.signed_distance(torch.cat((corners, bottom), -1)).amax(-1)
-        return distance[new.cumsum(0) - 1].view(position.shape[:-1])
+        return self._of_boxes(boxes[new])[new.cumsum(0) - 1].view(position.shape[:-1])
+
+    def _of_boxes(self, boxes: Tensor) -> Tensor:
+        """Signed distance of boxes ``[n, 7]``, x, y, z, heading, length, width, height: ``[n]`` [m]."""
+        corners = box_corners(torch.cat((boxes[:, :2], boxes[:, 3:6]), -1))
+        bottom = (boxes[:, 2] - boxes[:, 6] / 2)[:, None, None].expand(-1, 4, 1)
+        return self.signed_distance(torch.cat((corners, bottom), -1)).amax(-1)
 
     @cached_property
     def _columns(self) -> tuple[Tensor, ...]:
@@ -203,14 +218,17 @@ class RoadEdges:
 
     def _first_nearest(self, points: Tensor, table: Tensor) -> Tensor:
         """The first of the nearest ones among some segments: ``[3, n]``, ``[c, n]`` -> ``[n]``."""
+        return table.gather(0, self._place_of_nearest(points, table)[None])[0]
+
+    def _place_of_nearest(self, points: Tensor, table: Tensor) -> Tensor:
+        """Where it is in the table, ``[n]`` int64; one table ``[c, 1]`` may serve all points."""
         near = self._project(points, table)
         height = near.z.mul_(self.height_stretch)
         squared = near.x.square_().add_(near.y.square_()).add_(height.square_())
         # Segments of one map often tie but for the last bit, so it is their distances in float32 that are compared.
         tied = squared <= _largest_of_same_root(squared.amin(0))
         order = torch.arange(len(table), 0, -1, dtype=torch.int32, device=table.device)[:, None]
-        first = len(table) - tied.to(torch.int32).mul_(order).amax(0)
-        return table.gather(0, first[None].long())[0]
+        return (len(table) - tied.to(torch.int32).mul_(order).amax(0)).long()
 
     def _side(self, points: Tensor, segment: Tensor, projection: _Projection) -> Tensor:
         """+1 right of the edge, -1 left: ``[3, n]``, ``[n]`` -> ``[n]``.
@@ -221,12 +239,19 @@ class RoadEdges:
         side = projection.side.clone()
 
         def ask(neighbour: Tensor, beyond: Tensor, *, before: bool) -> None:
-            row = (beyond & (neighbour[segment] != _NO_SEGMENT)).nonzero()[:, 0]
-            own, other = segment[row], neighbour[segment[row]]
+            asked = beyond & (neighbour[segment] != _NO_SEGMENT)
+            if not on_host(asked):
+                side.copy_(torch.where(asked, answer(neighbour, slice(None), before), side))
+                return
+            row = asked.nonzero()[:, 0]
+            side[row] = answer(neighbour, row, before)
+
+        def answer(neighbour: Tensor, row: Tensor | slice, before: bool) -> Tensor:
+            own, other = segment[row], neighbour[segment[row]].clamp(min=0)
             first, second = (other, own) if before else (own, other)
             convex = _cross(self.delta[first], self.delta[second]) > 0
             mine, its = projection.side[row], self._project(points[:, row], other).side
-            side[row] = torch.where(convex, torch.maximum(mine, its), torch.minimum(mine, its))
+            return torch.where(convex, torch.maximum(mine, its), torch.minimum(mine, its))
 
         ask(self.previous, projection.t < 0, before=True)
         ask(self.following, projection.t > 1, before=False)
@@ -245,10 +270,15 @@ class RoadEdges:
         """Index of the nearest segment, the first in map order on ties: ``[3, n]`` -> ``[n]``.
 
         Queries are gathered in boxes, from coarse to fine. Each box inherits the candidates of the coarser box around
-        it and keeps those segments that can still be the nearest one of some point inside.
+        it and keeps those segments that can still be the nearest one of some point inside. A device looks at all
+        segments, for it would have to be waited for to hear how many are left.
         """
         if not points.shape[1]:
             return torch.empty(0, dtype=torch.int64, device=points.device)
+        if not on_host(points):
+            every = torch.arange(len(self.start), device=points.device)[:, None]
+            rows = max(1, _PAIRS_ON_DEVICE // len(every))
+            return torch.cat([self._place_of_nearest(some, every) for some in points.split(rows, 1)])
         levels, leaf = _nested_boxes(points)
         every = torch.arange(len(self.start), device=points.device)
         candidates = Ragged.from_parts(1, [(every[:1], every[-1:] + 1, every)])
@@ -327,9 +357,12 @@ class _Boxes:
 def _finite_columns(points: Tensor) -> Tensor:
     """Points ``[..., 3]`` as ``[3, n]``, refused where one is not finite."""
     flat = points.reshape(-1, 3).T.contiguous()
-    if not torch.isfinite(flat).all():
+
+    def refused() -> str:
         bad = flat[:, ~torch.isfinite(flat).all(0)][:, 0].tolist()
-        raise ValueError(f"the distance to the road edge needs finite points, got {bad}; mask such points out.")
+        return f"the distance to the road edge needs finite points, got {bad}; mask such points out."
+
+    require(torch.isfinite(flat).all(), refused)
     return flat
 
 

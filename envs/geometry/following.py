@@ -54,18 +54,18 @@ def time_to_collision(
     """
     length, width = extent[..., 0, None], extent[..., 1, None]
     result = []
-    for one in ego.tolist():
-        turn = heading - heading[:, one, None]
+    for one in ego.split(1):  # a row of length 1 stays, so that no index is read back
+        turn = heading - heading[:, one]
         if not unwrapped_turn:
             turn = wrap_angle(turn)
         turn = turn.abs()
         cos, sin = turn.cos().abs(), turn.sin().abs()
-        ahead, aside = rotate(position - position[:, one, None], -heading[:, one, None]).unbind(-1)
-        gap = ahead - length[:, one, None] / 2 - (length * cos + width * sin) / 2
-        overlap = aside.abs() - width[:, one, None] / 2 - (length * sin + width * cos) / 2
+        ahead, aside = rotate(position - position[:, one], -heading[:, one]).unbind(-1)
+        gap = ahead - length[:, one] / 2 - (length * cos + width * sin) / 2
+        overlap = aside.abs() - width[:, one] / 2 - (length * sin + width * cos) / 2
         aligned = (turn <= _FOLLOW_ANGLE) & ((overlap < -_SMALL_OVERLAP) | (turn <= _FOLLOW_ANGLE_SMALL_OVERLAP))
         followed = (gap > 0) & (overlap < 0) & aligned & valid
-        nearest, leader = torch.where(followed, gap, torch.inf).min(1)
-        closing = speed[:, one] - speed.gather(1, leader[:, None])[:, 0]
+        nearest, leader = torch.where(followed, gap, torch.inf).min(1, keepdim=True)
+        closing = speed[:, one] - speed.gather(1, leader)
         result.append(torch.where(closing > 0, (nearest / closing).clamp(max=LONGEST_TIME), LONGEST_TIME))
-    return torch.stack(result, 1)
+    return torch.cat(result, 1)

@@ -7,8 +7,12 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from envs.devices import on_host, require
+
 LEVEL_STRETCH = 3.0
 """Weight of height in "nearest", so that a bridge is far from the road below it (realism.md section 4.1)."""
+_PAIRS_ON_DEVICE = 1 << 24
+"""Pairs of a place and a map point whose distances are in memory together on a device."""
 KNOT_STEPS = 5
 """Steps of 0.1 s between two looks at the map; heights between them are interpolated."""
 
@@ -16,8 +20,10 @@ KNOT_STEPS = 5
 class Ground:
     """Heights of a map's points, asked for by place and level.
 
+    On a CPU a tree finds the nearest point; a device looks at all of them, and of points equally near takes the first.
+
     Args:
-        points: ``[N, 3]`` map points [m].
+        points: ``[N, 3]`` map points [m]; places are asked for on their device.
 
     Raises:
         ValueError: there is no point.
@@ -31,9 +37,10 @@ class Ground:
     def __init__(self, points: Tensor) -> None:
         if len(points) == 0:
             raise ValueError("the map has no point, so the ground has no height; give the scene a road edge.")
-        points = points.detach().cpu().numpy()
-        self._height = points[:, 2].astype(np.float32)
-        self._tree = cKDTree(points * (1.0, 1.0, LEVEL_STRETCH))
+        points = points.detach()
+        self._height = points[:, 2].float()
+        self._points = _stretched(points[:, :2], points[:, 2])
+        self._tree = cKDTree(self._points.numpy()) if on_host(points) else None
 
     def height(self, xy: Tensor, level: Tensor) -> Tensor:
         """Height of the nearest map point on the level given.
@@ -45,9 +52,20 @@ class Ground:
         Returns:
             ``[...]`` [m].
         """
-        query = torch.cat((xy, LEVEL_STRETCH * level[..., None]), -1).detach().cpu().numpy()
-        _, nearest = self._tree.query(query)
-        return torch.from_numpy(self._height[nearest]).to(xy.device)
+        query = torch.cat((xy, LEVEL_STRETCH * level[..., None]), -1).detach()
+        if self._tree is not None:
+            return self._height[torch.from_numpy(np.asarray(self._tree.query(query.numpy())[1]))]
+        flat, rows = query.double().view(-1, 3), max(1, _PAIRS_ON_DEVICE // len(self._points))
+        nearest = [
+            torch.cdist(some, self._points, compute_mode="donot_use_mm_for_euclid_dist").argmin(-1)
+            for some in flat.split(rows)
+        ]
+        return self._height[torch.cat(nearest)].view(level.shape)
+
+
+def _stretched(xy: Tensor, z: Tensor) -> Tensor:
+    """Places ``[*, 3]`` float64 between which the distance is what "nearest" means."""
+    return torch.cat((xy.double(), LEVEL_STRETCH * z.double()[..., None]), -1)
 
 
 def lift(poses: Tensor, start: Tensor, points: Tensor) -> Tensor:
@@ -59,7 +77,7 @@ def lift(poses: Tensor, start: Tensor, points: Tensor) -> Tensor:
     Args:
         poses: ``[R, A, T, 3]`` x, y, heading at 10 Hz from the step after the current one on.
         start: ``[A, 3]`` x, y, z at the current step, of the agents' centres [m].
-        points: ``[N, 3]`` map points [m].
+        points: ``[N, 3]`` map points [m]; they and ``start`` are brought to the device of the poses.
 
     Returns:
         ``[R, A, T, 4]`` x, y, z, heading.
@@ -77,10 +95,13 @@ def lift(poses: Tensor, start: Tensor, points: Tensor) -> Tensor:
         raise ValueError(
             f"poses of {poses.shape[1]} agents do not fit the starts of {len(start)}; give the same agents."
         )
-    if not torch.isfinite(poses).all():
+
+    def refused() -> str:
         agent = int((~torch.isfinite(poses)).any(-1).any(-1).any(0).nonzero()[0])
-        raise ValueError(f"a pose of agent {agent} is not finite, so it has no height; mend the rollout.")
-    ground = Ground(points)
+        return f"a pose of agent {agent} is not finite, so it has no height; mend the rollout."
+
+    require(torch.isfinite(poses).all(), refused)
+    ground = Ground(points.to(poses.device))
     start = start.to(poses)
     first = ground.height(start[:, :2], start[:, 2]).expand(poses.shape[:2])
     rise = climb(ground, poses, start[:, 2].expand(poses.shape[:2]), first)
@@ -120,9 +141,8 @@ def _knots(steps: int) -> list[int]:
 
 def _interpolate(knots: list[int], values: Tensor) -> Tensor:
     """Values ``[..., len(knots)]`` at the knots -> ``[..., knots[-1]]`` at the steps 1, 2, ..., knots[-1]."""
-    places = torch.tensor(knots, device=values.device)
     steps = torch.arange(1, knots[-1] + 1, device=values.device)
-    right = torch.searchsorted(places, steps)
-    left = right - 1
-    part = ((steps - places[left]) / (places[right] - places[left])).to(values)
-    return torch.lerp(values[..., left], values[..., right], part)
+    left = (steps - 1) // KNOT_STEPS
+    start, end = left * KNOT_STEPS, ((left + 1) * KNOT_STEPS).clamp(max=knots[-1])
+    part = ((steps - start) / (end - start)).to(values)
+    return torch.lerp(values[..., left], values[..., left + 1], part)

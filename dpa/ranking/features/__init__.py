@@ -11,6 +11,7 @@ from dpa.ranking.features.measure import (
     feature_names,
     feature_weights,
     log_trajectory,
+    logged_steps,
     occupancy_features,
 )
 from dpa.ranking.features.paper import FEATURE_SETS
@@ -27,6 +28,7 @@ __all__ = [
     "feature_names",
     "feature_weights",
     "log_trajectory",
+    "logged_steps",
     "occupancy_features",
     "register",
 ]

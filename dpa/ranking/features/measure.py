@@ -110,7 +110,7 @@ def occupancy_features(
     current one come from the log on both sides. So a hole in the log costs the steps after it and nothing else.
 
     Args:
-        scene: an uncollated scene.
+        scene: an uncollated scene, on the CPU; features are computed where the trajectories are.
         trajectories: ``[R, A, T, 4]`` x, y, z, heading at 10 Hz after the current step, of the present agents in the
             order of the scene; rollouts (see :func:`~envs.geometry.ground.lift`) or the log (:func:`log_trajectory`).
         names: a set of :data:`FEATURE_SETS` or names of :data:`FEATURES`.
@@ -134,10 +134,43 @@ def occupancy_features(
     names = feature_names(names)
     ranges = feature_clips(names, clips)
     motion = _motion(scene, trajectories, ego, stride)
-    past = max(FEATURES[name].past for name in names)
-    valid = torch.stack([motion.valid[motion.ego][:, motion.steps - back] for back in range(past + 1)]).all(0)
+    valid = logged_steps(scene, trajectories.shape[2], names, ego=ego, stride=stride).to(trajectories.device)
     phi = torch.stack([FEATURES[name].compute(motion).clamp(*ranges[name]) for name in names], -1)
     return torch.where(valid[..., None], phi, 0.0), valid
+
+
+def logged_steps(
+    scene: Scene,
+    steps: int,
+    names: str | Sequence[str] = "full",
+    *,
+    ego: Tensor | None = None,
+    stride: int = 1,
+) -> Tensor:
+    """At which measured steps the log has what features read, where the scene is: nobody waits for a device to know.
+
+    Args:
+        scene: an uncollated scene.
+        steps: T.
+        names: of the features, as for :func:`occupancy_features`.
+
+    Keyword Args:
+        ego: ``[E]`` int64, rows of the agents to measure; all of them by default.
+        stride: measure every ``stride``-th step.
+
+    Returns:
+        ``[E, T // stride]`` bool.
+
+    Examples:
+        >>> from envs.sources.synthetic import straight_road
+        >>> logged_steps(straight_road(2), 80, stride=5).shape
+        torch.Size([2, 16])
+    """
+    valid = scene.agents.valid[scene.agents.present]
+    valid = valid if ego is None else valid[ego]
+    at = torch.arange(CURRENT_STEP + stride, CURRENT_STEP + 1 + steps, stride, device=valid.device)
+    past = max(FEATURES[name].past for name in feature_names(names))
+    return torch.stack([valid[:, at - back] for back in range(past + 1)]).all(0)
 
 
 def _motion(scene: Scene, trajectories: Tensor, ego: Tensor | None, stride: int) -> Motion:
@@ -151,15 +184,15 @@ def _motion(scene: Scene, trajectories: Tensor, ego: Tensor | None, stride: int)
         )
     if not 1 <= stride <= steps:
         raise ValueError(f"stride must be 1 to {steps} (the number of steps), got {stride}.")
-    history = slice(CURRENT_STEP + 1 - CONTEXT, CURRENT_STEP + 1)
+    history, device = slice(CURRENT_STEP + 1 - CONTEXT, CURRENT_STEP + 1), trajectories.device
     before = _poses(scene)[:, history].to(trajectories).expand(len(trajectories), -1, -1, -1)
     return Motion(
         scene=scene,
         poses=torch.cat((before, trajectories), 2),
-        valid=agents.valid[present][:, history.start : history.stop + steps],
-        extent=agents.extent[present],
-        ego=torch.arange(int(present.sum())) if ego is None else ego,
-        steps=torch.arange(stride - 1, steps, stride) + CONTEXT,
+        valid=agents.valid[present][:, history.start : history.stop + steps].to(device),
+        extent=agents.extent[present].to(device),
+        ego=torch.arange(trajectories.shape[1], device=device) if ego is None else ego.to(device),
+        steps=torch.arange(stride - 1, steps, stride, device=device) + CONTEXT,
     )
 
 

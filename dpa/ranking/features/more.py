@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dpa.ranking.features.registry import CONTEXT, Motion, register
+from envs.devices import of_rows
 from envs.geometry.edges import RoadEdges
 from envs.geometry.following import LONGEST_TIME, time_to_collision
 from envs.geometry.frames import wrap_angle
@@ -74,9 +75,9 @@ def motion_on_lanes(motion: Motion, name: str) -> tuple[Tensor, Tensor]:
     lines = [line for line in polylines(motion.scene, LANE_KINDS) if len(line) >= 2]
     if not lines:
         raise ValueError(f"scene {motion.scene.scene_id} has no lane, which the feature {name!r} needs; leave it out.")
-    there = motion.ego_valid
-    ground = motion.ego_poses()[:, there][..., :3].clone()
-    ground[..., 2] -= motion.extent[motion.ego][:, None, 2].expand(there.shape)[there] / 2
-    found = motion.poses.new_zeros(2, *motion.shape)
-    found[:, :, there] = torch.stack(RoadEdges.from_polylines(lines).nearest(ground))
-    return found[0], found[1]
+    ground = motion.ego_poses()[..., :3].clone()
+    ground[..., 2] -= motion.extent[motion.ego][:, None, 2] / 2
+    lanes = RoadEdges.from_polylines(lines).to(ground.device)
+    there = motion.ego_valid.expand(motion.shape)
+    found = of_rows(there, lambda places: torch.stack(lanes.nearest(places), -1), ground)
+    return found[..., 0], found[..., 1]

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from dpa.ranking.features.registry import Motion, register
+from envs.devices import of_rows
 from envs.geometry.edges import RoadEdges
 from envs.scene import EDGE_KINDS, STEP_SECONDS, polylines
 
@@ -19,13 +20,11 @@ def collision(motion: Motion) -> Tensor:
 @register("road_edge", unit="m", clip=(-20.0, 40.0), weight=5.0, spread=1.7)
 def road_edge(motion: Motion) -> Tensor:
     """Signed distance to the road edge of the corner farthest out; positive off the road."""
-    poses, extent = motion.ego_poses(), motion.extent[motion.ego][:, None].expand(*motion.shape[1:], 3)
-    distance = poses.new_zeros(motion.shape)
-    there = motion.ego_valid  # the look-up costs most of phi, and an absent agent has no place to ask for
-    poses, extent = poses[:, there], extent[there]
-    edges = RoadEdges.from_polylines(polylines(motion.scene, EDGE_KINDS))
-    distance[:, there] = edges.box_offroad_distance(poses[..., :3], poses[..., 3], extent)
-    return distance
+    poses, extent = motion.ego_poses(), motion.extent[motion.ego][:, None].expand(*motion.shape, 3)
+    edges = RoadEdges.from_polylines(polylines(motion.scene, EDGE_KINDS)).to(poses.device)
+    # The look-up costs most of phi, and an absent agent has no place to ask for.
+    there = motion.ego_valid.expand(motion.shape)
+    return of_rows(there, edges.box_offroad_distance, poses[..., :3], poses[..., 3], extent)
 
 
 @register("clearance", unit="m", clip=(-5.0, 40.0), weight=2.0, spread=3.2)

@@ -20,6 +20,8 @@ CONTEXT = 2
 class Motion:
     """What a feature sees: R futures of a scene, with two steps of logged history in front.
 
+    All but the scene is on the device of the poses.
+
     Attributes:
         scene: an uncollated scene.
         poses: ``[R, A, CONTEXT + T, 4]`` x, y, z, heading of the agents present at the current step.
@@ -62,7 +64,7 @@ class Motion:
         """``[R, E, T']`` signed distance to the nearest other agent [m]; two features share it."""
         poses = self.poses[:, :, self.steps]
         extent = self.extent[None, :, None, :2].expand(*poses.shape[:-1], 2)
-        boxes = torch.cat((poses[..., [0, 1, 3]], extent), -1).transpose(1, 2).contiguous()
+        boxes = torch.cat((poses[..., :2], poses[..., 3:], extent), -1).transpose(1, 2).contiguous()
         valid = self.valid[:, self.steps].T.expand(boxes.shape[:-1])
         return nearest_box_distance(boxes, valid, self.ego).transpose(1, 2)
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from dpa.ranking.transport.exact import Exact, TimeAligned, Windowed
 from dpa.ranking.transport.problems import Dense, Pairs, Plan, Problems, Solver
 from dpa.ranking.transport.sinkhorn import Sinkhorn
+from envs.devices import on_host
 
 __all__ = ["SOLVERS", "Dense", "Pairs", "Plan", "Problems", "Solver", "Transport", "make_solver", "transport_cost"]
 
@@ -29,8 +30,8 @@ SOLVERS: dict[str, Callable[..., Solver]] = {
 }
 """Every way to couple the steps of two measures, by name; what is called with a solver's options gives the solver."""
 
-CELLS_AT_ONCE = {"cpu": 1 << 22, "cuda": 1 << 26}
-"""Entries of the cost matrices that are in memory together, by type of device."""
+CELLS_ON_CPU, CELLS_ON_DEVICE = 1 << 22, 1 << 26
+"""Entries of the cost matrices that are in memory together."""
 
 
 class Transport(NamedTuple):
@@ -108,7 +109,8 @@ def transport_cost(
             one of steps near in time), ``"sinkhorn"`` (approximate, batched, where the features are) or
             ``"time_aligned"`` (each step with itself, over the steps valid on both sides).
         coupling: also return the couplings.
-        threads: blocks of problems solved at the same time (scipy releases the interpreter lock); changes no result.
+        threads: blocks of problems solved at the same time (scipy releases the interpreter lock); changes no result. A
+            device has one queue, so there they are not needed.
         step: time between two steps [s].
         options: of the solver, see :class:`~dpa.ranking.transport.exact.Windowed` and
             :class:`~dpa.ranking.transport.sinkhorn.Sinkhorn`.
@@ -129,7 +131,8 @@ def transport_cost(
     """
     solver = make_solver(method, **options)
     problems, batch = _problems(x, y, x_valid, y_valid, weights, step)
-    cells = CELLS_AT_ONCE["cuda" if x.is_cuda else "cpu"] // max(1, x.shape[-2] * y.shape[-2])
+    threads = threads if on_host(x) else 1
+    cells = (CELLS_ON_CPU if on_host(x) else CELLS_ON_DEVICE) // max(1, x.shape[-2] * y.shape[-2])
     blocks = problems.split(max(1, min(cells, -(-len(problems) // threads))))
 
     def solve(block: Problems) -> Transport:
@@ -156,7 +159,7 @@ def _problems(
     x: Tensor, y: Tensor, x_valid: Tensor, y_valid: Tensor, weights: Tensor, step: float
 ) -> tuple[Problems, torch.Size]:
     """All problems in a row, and how they were arranged."""
-    weights = torch.as_tensor(weights, dtype=torch.float64, device=x.device)
+    weights = torch.as_tensor(weights, dtype=torch.float64)  # looked at where they are, before they go to the device
     if weights.shape != (x.shape[-1],) or y.shape[-1] != x.shape[-1]:
         raise ValueError(
             f"x, y and weights need one size of features, got {x.shape[-1]}, {y.shape[-1]} and {tuple(weights.shape)}."
@@ -167,7 +170,7 @@ def _problems(
     x, y = (torch.where(valid[..., None], value, 0) for value, valid in ((x, x_valid), (y, y_valid)))
     x, y = (_flat(value, batch, 2) for value in (x, y))
     x_valid, y_valid = (_flat(value, batch, 1) for value in (x_valid, y_valid))
-    return Problems(x, y, x_valid, y_valid, weights, step), batch
+    return Problems(x, y, x_valid, y_valid, weights.to(x.device), step), batch
 
 
 def _flat(value: Tensor, batch: torch.Size, event_dims: int) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import ot
@@ -24,6 +25,8 @@ class Exact:
     With equal counts the marginals are those of a permutation matrix, so an assignment is optimal (Birkhoff), which
     scipy finds several times faster than a general solver would; POT's network simplex solves the rest.
     """
+
+    on_device: ClassVar[bool] = False
 
     def __call__(self, problems: Problems) -> Pairs:
         """Solve; see :class:`~dpa.ranking.transport.Solver`."""
@@ -46,6 +49,8 @@ class Windowed:
         ValueError: a window below 0.
     """
 
+    on_device: ClassVar[bool] = False
+
     window: float = 2.0
 
     def __post_init__(self) -> None:
@@ -62,6 +67,8 @@ class Windowed:
 class TimeAligned:
     """Each step with the same step of the other side, over the steps that are valid on both."""
 
+    on_device: ClassVar[bool] = False
+
     def __call__(self, problems: Problems) -> Pairs:
         """Solve; see :class:`~dpa.ranking.transport.Solver`.
 
@@ -77,7 +84,10 @@ class TimeAligned:
 
 
 def _solve(problems: Problems, reach: float | None) -> Pairs:
-    """The cheapest coupling of each problem, with a limit on the steps between partners where one is given."""
+    """The cheapest coupling of each problem, with a limit on the steps between partners where one is given.
+
+    Solvers are on the CPU: features on a device come over, here, and the couplings go back.
+    """
     x, y = ((value.double() * problems.weights.sqrt()).cpu().numpy() for value in (problems.x, problems.y))
     x_valid, y_valid = (valid.cpu().numpy() for valid in (problems.x_valid, problems.y_valid))
     device = problems.x.device

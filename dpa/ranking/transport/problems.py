@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -85,6 +85,9 @@ class Solver(Protocol):
 
     A field made with ``field(compare=False)`` is one that changes no result; provenance leaves it out.
     """
+
+    on_device: ClassVar[bool]
+    """It works where the features are; otherwise it brings them to the CPU."""
 
     def __call__(self, problems: Problems) -> Plan:
         """Solve problems; the plan is :class:`Pairs` or :class:`Dense`."""

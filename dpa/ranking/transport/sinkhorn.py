@@ -7,16 +7,18 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from dpa.ranking.transport.problems import Dense, Problems
+from envs.devices import on_host
 
 CHECK_EVERY = 10
-"""Iterations between two looks at the marginal error; on a GPU each look waits for the device."""
+"""Iterations between two looks at the marginal error; on a device each look waits for it."""
 CELLS_AT_ONCE = 1 << 17
-"""Of cost matrices on a CPU: what a core's cache holds. A GPU takes all that it is given."""
+"""Of cost matrices on a CPU: what a core's cache holds. A device takes all that it is given."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,8 @@ class Sinkhorn:
     Warns:
         UserWarning: some problem stopped by ``iterations`` and not by ``tolerance``.
     """
+
+    on_device: ClassVar[bool] = True
 
     epsilon: float = 0.02
     start: float | None = 1.0
@@ -67,7 +71,7 @@ class Sinkhorn:
 
     def __call__(self, problems: Problems) -> Dense:
         """Solve; see :class:`~dpa.ranking.transport.Solver`."""
-        if problems.x.is_cuda or len(problems) == 0:
+        if not on_host(problems.x) or len(problems) == 0:
             return self._solve(problems)
         count = max(1, CELLS_AT_ONCE // max(1, problems.x.shape[1] * problems.y.shape[1]))
         return Dense.cat([self._solve(some) for some in problems.split(count)])
@@ -98,7 +102,7 @@ class Sinkhorn:
             left = (a * (u - _potential(scaled, v, log_b, 2)).expm1().abs()).sum(-1)
             error = torch.where(done, error, left)
             done = done | (error <= self.tolerance)
-            if bool(done.all()):
+            if bool(done.all()):  # all that is read back from the device
                 break
         else:
             warnings.warn(
