@@ -347,7 +347,7 @@ def collate(scenes: Sequence[Scene]) -> Scene:
 def polylines(scene: Scene, kinds: Sequence[int]) -> list[Tensor]:
     """The polylines of some kinds of one uncollated scene, each ``[n, 3]``, in map order."""
     road = scene.road
-    keep = torch.isin(road.kind, torch.as_tensor(tuple(kinds)))
+    keep = torch.isin(road.kind, torch.as_tensor(tuple(kinds), device=road.kind.device))
     return [road.points[s : s + n] for s, n in zip(road.start[keep].tolist(), road.count[keep].tolist(), strict=True)]
 
 

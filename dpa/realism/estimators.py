@@ -56,7 +56,7 @@ def _groups(log: Tensor, config: Histogram | Kernel) -> Tensor:
 
 def _histogram(log: Tensor, group: Tensor, samples: Tensor, sample_group: Tensor, config: Histogram) -> Tensor:
     """Log of the smoothed share of samples in the bin of each logged value (realism.md section 6)."""
-    groups = int(group.max()) + 1
+    groups = (1 if config.pooled else log.shape[0]) * (log.shape[1] if config.per_step else 1)
     # every distribution has its own row of bins in one flat count
     count = torch.bincount(_bin(samples, config) + sample_group * config.bins, minlength=groups * config.bins)
     count = count.to(log.dtype).view(groups, config.bins)

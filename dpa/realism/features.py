@@ -16,6 +16,7 @@ from dpa.realism.config import Differences, RealismConfig
 from dpa.realism.lights import red_light_violation
 from dpa.realism.quirks import Quirk
 from dpa.realism.tracks import HORIZON, Comparison, Tracks, stack
+from envs.devices import of_rows
 from envs.geometry.boxes import nearest_box_distance
 from envs.geometry.edges import RoadEdges
 from envs.geometry.following import time_to_collision
@@ -173,7 +174,7 @@ def _time_to_collision(tracks: Tracks, config: RealismConfig) -> Tensor:
         speed,
         tracks.extent,
         valid,
-        torch.arange(tracks.num_ego),
+        torch.arange(tracks.num_ego, device=position.device),
         unwrapped_turn=Quirk.UNWRAPPED_TURN in config.quirks,
     )
 
@@ -190,9 +191,7 @@ def _road_edge(tracks: Tracks, scene: Scene, config: RealismConfig) -> Tensor:
     position, heading = tracks.position[:, ego, tracks.scored], tracks.heading[:, ego, tracks.scored]
     valid = tracks.valid[:, ego, tracks.scored]
     extent = tracks.extent[:, ego, None].expand(position.shape)
-    result = position.new_full(valid.shape, _OFF_MAP)
-    result[valid] = edges.box_offroad_distance(position[valid], heading[valid], extent[valid])
-    return result
+    return torch.where(valid, of_rows(valid, edges.box_offroad_distance, position, heading, extent), _OFF_MAP)
 
 
 def _red_lights(tracks: Tracks, scene: Scene, config: RealismConfig) -> Tensor:

@@ -96,10 +96,10 @@ def _with_neighbours(valid: Tensor, differences: Differences) -> Tensor:
     return result
 
 
-def event_rates(measured: Features, config: RealismConfig) -> dict[str, float]:
-    """Share of rollouts and agents to which each event happened."""
+def event_rates(measured: Features, config: RealismConfig) -> dict[str, Tensor]:
+    """Share of rollouts and agents to which each event happened, ``[]`` each."""
     return {
-        name: _happened(measured, event, config)[1:].float().mean().item()
+        name: _happened(measured, event, config)[1:].float().mean()
         for name, event in _RATES.items()
         if event in measured.values
     }

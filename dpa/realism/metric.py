@@ -108,10 +108,10 @@ def realism(
     present agents are obstacles. A likelihood over no step at all is NaN, and so is the meta-metric then.
 
     Args:
-        scene: one uncollated scene.
+        scene: one uncollated scene, on whose device the metric is computed.
         simulated: ``[R, A, 80, 4]``, x, y, z, heading of steps 11 to 90 in the scene's frame, where A are the agents
-            with ``scene.agents.present``, in that order. The standard is R = 32. With a configuration of the Scenario
-            Generation challenge ``[R, A, 91, 4]``, all steps.
+            with ``scene.agents.present``, in that order; from another device they are brought over. The standard is
+            R = 32. With a configuration of the Scenario Generation challenge ``[R, A, 91, 4]``, all steps.
         config: the year, a path or a :class:`RealismConfig`.
         quirks: ``False`` leaves out all that looks like an accident of the official code (:mod:`dpa.realism.quirks`):
             a cleaner metric, whose numbers compare with no others.
@@ -149,8 +149,8 @@ def realism_of(
     faster, as its working set stays in the cache (docs/studies/speed.md).
 
     Args:
-        scenes: uncollated, all on one device.
-        simulated: rollouts of each.
+        scenes: uncollated, all on one device: there the metric is computed.
+        simulated: rollouts of each; they are brought to the scenes.
         config: see :func:`realism`.
         quirks: see :func:`realism`.
         generated: see :func:`realism`.
@@ -170,8 +170,9 @@ def realism_of(
     extras = [None] * len(scenes) if generated is None else generated
     comparisons = []
     for scene, poses, extra in zip(scenes, simulated, extras, strict=True):
+        poses = poses.to(scene.agents.position)  # the one way from where they were rolled out to where the scene is
         _check(scene, poses, config, extra)
-        comparisons.append(compare(scene, poses.to(scene.agents.position.dtype), config, extra))
+        comparisons.append(compare(scene, poses, config, extra))
     return [
         _score(measured, config, features)
         for batch in _batches(comparisons, memory * BYTES_PER_GIB)
@@ -209,9 +210,9 @@ def realism_of_groups(
     """
     if any(len(group) == 0 for group in groups):
         raise ValueError(f"scene {scene.scene_id}: a group without rollouts has no realism; give each at least one.")
-    config = _opened(config, quirks)
+    config, simulated = _opened(config, quirks), simulated.to(scene.agents.position)
     _check(scene, simulated, config, None)
-    (measured,) = measure([compare(scene, simulated.to(scene.agents.position.dtype), config)], config)
+    (measured,) = measure([compare(scene, simulated, config)], config)
     return [_score(measured.of(group), config, features=False) for group in groups]
 
 
@@ -277,16 +278,20 @@ def _batches(comparisons: list[Comparison], budget: float) -> Iterator[list[Comp
 
 
 def _score(measured: Features, config: RealismConfig, features: bool) -> RealismResult:
-    scored = scores(measured, config)
-    likelihood = {name: (total.sum() / count.sum()).exp().item() for name, (total, count) in scored.items()}
+    scored, rates = scores(measured, config), event_rates(measured, config)
     weights, displacement = config.weights, measured.displacement
     displacement = displacement[:, ~displacement.isnan().any(0)]  # without history, an agent may have no step at all
+    figures = {name: (total.sum() / count.sum()).exp() for name, (total, count) in scored.items()}
+    figures |= rates | {"min_ade": displacement.mean(1).min(), "ade": displacement.mean()}
+    # Read at once: each look at a figure would wait for the device.
+    figures = dict(zip(figures, torch.stack(list(figures.values())).tolist(), strict=True))
+    likelihood = {name: figures[name] for name in scored}
     return RealismResult(
         realism=sum(weights[name] * value for name, value in likelihood.items()),
         likelihood=likelihood,
-        rate=event_rates(measured, config),
-        min_ade=displacement.mean(1).min().item(),
-        ade=displacement.mean().item(),
+        rate={name: figures[name] for name in rates},
+        min_ade=figures["min_ade"],
+        ade=figures["ade"],
         features=measured if features else None,
         **{bucket: _weighted_mean(likelihood, weights, names) for bucket, names in BUCKETS.items()},
     )

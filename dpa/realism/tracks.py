@@ -97,7 +97,7 @@ def compare(scene: Scene, simulated: Tensor, config: RealismConfig, generated: G
     scene, simulated, num_ego = select_agents(scene, order), simulated[:, order], int(evaluated.sum())
     if config.scenario_generation:
         if generated is not None:
-            generated = Generated(*(part[:, order] for part in generated))
+            generated = Generated(*(part.to(order.device)[:, order] for part in generated))
         return Comparison(scene, simulated, _join_generated(scene, simulated, num_ego, generated))
     return Comparison(scene, simulated, _join(scene, simulated, num_ego, Quirk.GHOSTS in config.quirks))
 

@@ -42,10 +42,14 @@ class Motion:
     def of(cls, scene: Scene, trajectories: Tensor, controlled: Tensor) -> Motion:
         """Put the history of the log in front of trajectories (arguments: see :func:`~dpa.safety.safety`).
 
+        What is unsafe is looked for pair by pair and light by light, on the CPU with the scene; trajectories from a
+        device come over here, and nothing else does.
+
         Raises:
             ValueError: trajectories or controlled do not fit the scene.
         """
         agents, present = scene.agents, scene.agents.present
+        trajectories, controlled = (value.to(present.device) for value in (trajectories, controlled))
         num, room = int(present.sum()), agents.valid.shape[-1] - NOW - 1
         if trajectories.dim() != 4 or trajectories.shape[1] != num or trajectories.shape[-1] != 4:
             raise ValueError(

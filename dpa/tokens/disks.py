@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from dpa.tokens.base import MotionTokenizer
 from dpa.tokens.vocabulary import corners, digest_of, read_vocabulary
+from envs.devices import of_rows, on_host
 from envs.scene import STEP_SECONDS, AgentKind
 
 NEAR = 5
@@ -97,10 +99,17 @@ class KDisksTokenizer(MotionTokenizer):
     def encode(self, target: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
         """The entry of the class that comes nearest; of equals the first."""
         token = torch.zeros_like(kind)
-        for each in kind.unique().tolist():
+        # A device would have to be waited for to hear which classes there are, so there all of them are tried.
+        for each in kind.unique().tolist() if on_host(kind) else AgentKind:
             own = kind == each
-            token[own] = torch.cdist(corners(target[own], AgentKind(each)), self.points[each]).argmin(-1)
+            nearest = of_rows(own, partial(self._nearest, AgentKind(each)), target)
+            token = torch.where(own, nearest, token)
         return token
+
+    def _nearest(self, kind: AgentKind, target: Tensor) -> Tensor:
+        """The nearest entry of a class to motions ``[*, F, 3]``: ``[*]``."""
+        places = corners(target.reshape(-1, *target.shape[-2:]), kind)
+        return torch.cdist(places, self.points[kind]).argmin(-1).view(target.shape[:-2])
 
     def decode(self, token: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
         """The motion itself."""

@@ -46,8 +46,10 @@ def corners(motions: Tensor, kind: AgentKind) -> Tensor:
         >>> corners(torch.zeros(7, 5, 3), AgentKind.VEHICLE).shape
         torch.Size([7, 40])
     """
-    size = motions.new_tensor(BOXES.get(kind, BOXES[AgentKind.VEHICLE])).expand(*motions.shape[:-1], 2)
-    return box_corners(torch.cat((motions, size), -1)).flatten(-3)
+    length, width = (
+        motions.new_full((*motions.shape[:-1], 1), side) for side in BOXES.get(kind, BOXES[AgentKind.VEHICLE])
+    )
+    return box_corners(torch.cat((motions, length, width), -1)).flatten(-3)
 
 
 def logged_motions(scenes: Iterable[Scene], steps: int) -> dict[AgentKind, Tensor]:
