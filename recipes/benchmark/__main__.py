@@ -1,5 +1,6 @@
 """How fast the parts are, and how much memory they take, on the machine at hand.
 
+python -m recipes.benchmark device --model nano                    # kernels and synchronisations of a decision
 python -m recipes.benchmark realism                                # crowded scenes made on the spot
 python -m recipes.benchmark realism --scenarios FILE --json out.json    # scenarios of your own
 python -m recipes.benchmark rollout --sweep                        # against a naive decoder and the machine's limit
@@ -18,10 +19,11 @@ from pathlib import Path
 import torch
 
 from envs.files import write_json
-from recipes.benchmark import realism, rollout, scenes, training, transport
+from recipes.benchmark import device, realism, rollout, scenes, training, transport
 from recipes.common.provenance import processor
 
 PARTS = {
+    "device": (device, "kernels and synchronisations of a decision and of a ranking, part by part"),
     "realism": (realism, "seconds of the realism metric per scene"),
     "rollout": (rollout, "agent-steps per second with the policy in the loop"),
     "scenes": (scenes, "raw files against a store: size, conversion, batches"),

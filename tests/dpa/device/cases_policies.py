@@ -1,8 +1,8 @@
-"""Policies stay on their device: a tensor elsewhere, or a number that is read back, fails here and not on a user's GPU.
+"""Policies and losses stay on their device: a tensor elsewhere, or a number that is read back, fails here.
 
 There is no GPU here. PyTorch runs on a device that computes nothing (fake tensors know shapes, types and devices), a
-registered one of its own, since a build for CPUs has no CUDA to pretend. A process that has registered it is no good
-for anything else, so ``test_device.py`` runs these cases in one of their own.
+registered one, since a build for CPUs has no CUDA to pretend. Gradients go through it; what reads anything back does
+not, and is in the other cases, on a device that computes.
 """
 
 from __future__ import annotations
@@ -15,15 +15,14 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTensorDeviceMismatchError, FakeTensorMode
-from torch.utils import backend_registration
 
 from dpa.losses import ContrastivePreferenceLoss, NextTokenLoss, PolicyGradientLoss, token_network
 from dpa.models import MotionModel, collate_contexts, make_context
 from dpa.models.base import Observation
 from dpa.models.registry import build_model, size_of
 from dpa.tokens import KDisksTokenizer, MotionTokenizer, VerletTokenizer
+from recipes.benchmark.pretended import DEVICE, register
 
-DEVICE = "nowhere"
 SMALLEST = {"motionlm": "nano", "smart": "nano", "trajeglish": "nano"}
 families = pytest.mark.parametrize("family", sorted(SMALLEST))
 TOKENIZERS: dict[str, Callable[[], MotionTokenizer]] = {
@@ -32,18 +31,10 @@ TOKENIZERS: dict[str, Callable[[], MotionTokenizer]] = {
 }
 
 
-class Nowhere(backend_registration._DummyBackendModule):
-    """What autocast asks of a device."""
-
-    def get_amp_supported_dtype(self) -> list[torch.dtype]:
-        return [torch.bfloat16, torch.float16]
-
-
 @pytest.fixture(scope="module")
 def elsewhere() -> FakeTensorMode:
     """A mode in which tensors are on :data:`DEVICE`."""
-    if torch._C._get_privateuse1_backend_name() != DEVICE:
-        backend_registration._setup_privateuseone_for_python_backend(DEVICE, Nowhere())
+    register()
     return FakeTensorMode()
 
 
