@@ -17,6 +17,7 @@ from torch import Tensor
 
 from envs.devices import on_host, require
 from envs.geometry.boxes import box_corners
+from envs.geometry.cells import Boxes, nested_boxes
 from envs.geometry.ragged import Ragged
 
 HEIGHT_STRETCH = 3.0
@@ -24,8 +25,6 @@ HEIGHT_STRETCH = 3.0
 CYCLE_GAP = 1.0
 """A polyline whose ends are nearer than this is a ring [m]."""
 
-_CELL_SIZES = (32.0, 8.0, 1.0)
-"""Sides of the cells in which queries share their candidate segments, from coarse to fine [m]."""
 _MARGIN = 1e-6
 """Room for float32 rounding when a segment is ruled out for a cell, as a part of the largest coordinate."""
 _TINY = torch.finfo(torch.float32).tiny
@@ -279,7 +278,7 @@ class RoadEdges:
             every = torch.arange(len(self.start), device=points.device)[:, None]
             rows = max(1, _PAIRS_ON_DEVICE // len(every))
             return torch.cat([self._place_of_nearest(some, every) for some in points.split(rows, 1)])
-        levels, leaf = _nested_boxes(points)
+        levels, leaf = nested_boxes(points, HEIGHT_STRETCH)
         every = torch.arange(len(self.start), device=points.device)
         candidates = Ragged.from_parts(1, [(every[:1], every[-1:] + 1, every)])
         for level in levels:
@@ -289,7 +288,7 @@ class RoadEdges:
             nearest[row] = self._first_nearest(points.index_select(1, row), table)
         return nearest
 
-    def _narrow(self, candidates: Ragged, boxes: _Boxes) -> Ragged:
+    def _narrow(self, candidates: Ragged, boxes: Boxes) -> Ragged:
         """Candidates of each box among those of the coarser box around it.
 
         Let ``v`` lead from the place on a segment that is nearest to the centre of the box to that centre, height
@@ -339,21 +338,6 @@ class _Projection(NamedTuple):
     side: Tensor | None
 
 
-@dataclass(frozen=True)
-class _Boxes:
-    """One level of nested boxes of query points.
-
-    Attributes:
-        centre: ``[3, m]`` [m].
-        half: ``[3, m]``, half sides, no larger than the points inside need [m].
-        parent: ``[m]`` int64, the box of the coarser level around each.
-    """
-
-    centre: Tensor
-    half: Tensor
-    parent: Tensor
-
-
 def _finite_columns(points: Tensor) -> Tensor:
     """Points ``[..., 3]`` as ``[3, n]``, refused where one is not finite."""
     flat = points.reshape(-1, 3).T.contiguous()
@@ -364,34 +348,6 @@ def _finite_columns(points: Tensor) -> Tensor:
 
     require(torch.isfinite(flat).all(), refused)
     return flat
-
-
-def _nested_boxes(points: Tensor) -> tuple[list[_Boxes], Tensor]:
-    """Gather ``[3, n]`` points in boxes; the levels from coarse to fine, and the finest box ``[n]`` of each point."""
-    low = high = points
-    inner_to_outer: list[Tensor] = []
-    sides: list[tuple[Tensor, Tensor]] = []
-    for size in reversed(_CELL_SIZES):
-        cell, owner = torch.unique(_cell_key(low, size), return_inverse=True)
-        index = owner.expand(3, -1)
-        low = low.new_full((3, len(cell)), torch.inf).scatter_reduce_(1, index, low, "amin")
-        high = high.new_full((3, len(cell)), -torch.inf).scatter_reduce_(1, index, high, "amax")
-        inner_to_outer.append(owner)
-        sides.append((low, high))
-    leaf, *parents = inner_to_outer
-    parents.append(torch.zeros_like(low[0], dtype=torch.int64))
-    levels = [
-        _Boxes((low + high) / 2, (high - low) / 2, parent) for (low, high), parent in zip(sides, parents, strict=True)
-    ]
-    return levels[::-1], leaf
-
-
-def _cell_key(points: Tensor, size: float) -> Tensor:
-    """One int64 for the cell of each point, ``[3, n]`` -> ``[n]``; far cells share a key, which costs only time."""
-    sides = torch.tensor([[size], [size], [size / (2 * HEIGHT_STRETCH)]], device=points.device)
-    limit = 1 << 20
-    x, y, z = (points / sides).floor_().clamp_(-limit, limit - 1).long().add_(limit)
-    return (x * 2 * limit + y) * 2 * limit + z
 
 
 def _largest_of_same_root(squared: Tensor) -> Tensor:

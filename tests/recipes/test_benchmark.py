@@ -43,6 +43,23 @@ def test_the_metric_is_timed_on_files_of_ones_own(
     assert "s per scene" in " ".join(capsys.readouterr().out.split())
 
 
+@pytest.mark.slow
+def test_kernels_and_synchronisations_are_printed_part_by_part(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, sizes = tmp_path / "out.json", ["--agents", "2", "--rollouts", "2", "--scenes", "1"]
+    assert main(["device", "--model", "nano", "--device", "nowhere", *sizes, "--json", str(out)]) == 0
+    rows = {row["part"]: row for row in json.loads(out.read_text())["rows"]}
+    assert rows["policy"]["synchronisations"] == 1 and rows["env step"]["synchronisations"] == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "kernels" in printed and "synchronisations" in printed and "ranking of a scene, sinkhorn" in printed
+
+
+def test_sizes_that_cannot_be_counted_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["device", "--agents", "0"]) == 2
+    assert "--agents must be 1 or more" in capsys.readouterr().err
+
+
 def test_a_file_that_is_not_there_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["realism", "--scenarios", "nowhere"]) == 2
     assert "nowhere does not exist" in capsys.readouterr().err
