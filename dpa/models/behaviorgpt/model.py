@@ -81,7 +81,7 @@ class BehaviorGPT(FactorisedModel):
         self.own = mlp(3, width)
         self.weight = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, config.modes))
         self.start, self.mode = nn.Linear(width, inner), nn.Embedding(config.modes, inner)
-        self.when, self.unroll = nn.Embedding(tokenizer.steps, inner), nn.GRUCell(inner, inner)
+        self.when, self.recur = nn.Embedding(tokenizer.steps, 3 * inner), nn.Linear(inner, 3 * inner)
         self.out = nn.Linear(inner, 6)
         self._calm()
 
@@ -102,12 +102,19 @@ class BehaviorGPT(FactorisedModel):
         pooled = (score.softmax(2) * frames).sum(2)
         return self.value(pooled) + self.own(extent / METRES) + self.kind(kind)
 
+    def _next(self, state: Tensor, when: Tensor) -> Tensor:
+        """State of the frame to come, by a gated recurrent unit whose input is which frame it is."""
+        reset, keep, new = when.chunk(3)
+        forget, hold, said = self.recur(state).chunk(3, -1)
+        new = (new + (reset + forget).sigmoid() * said).tanh()
+        return new + (keep + hold).sigmoid() * (state - new)
+
     def decide(self, x: Tensor, recent: Tensor) -> Tensor:
         """See :meth:`~dpa.models.factorised.FactorisedModel.decide`: a row of :class:`Mixture` numbers."""
         hidden = (self.start(x)[..., None, :] + self.mode.weight).tanh()  # [*, K, inner]
         shape, state, frames = hidden.shape, hidden.flatten(0, -2), []
         for when in self.when.weight:
-            state = self.unroll(when.expand_as(state), state)
+            state = self._next(state, when)
             frames.append(self.out(state))
         said = torch.stack(frames, -2).view(*shape[:-1], len(frames), 6)
         last = to_local(recent[..., -1, :], recent[..., -2, :])

@@ -19,16 +19,8 @@ from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTens
 from dpa.losses import ContrastivePreferenceLoss, NextTokenLoss, PolicyGradientLoss, token_network
 from dpa.models import MotionModel, collate_contexts, make_context
 from dpa.models.base import Observation
-from dpa.models.registry import build_model, size_of
-from dpa.tokens import KDisksTokenizer, MotionTokenizer, VerletTokenizer
 from recipes.benchmark.pretended import DEVICE, register
-
-SMALLEST = {"motionlm": "nano", "smart": "nano", "trajeglish": "nano"}
-families = pytest.mark.parametrize("family", sorted(SMALLEST))
-TOKENIZERS: dict[str, Callable[[], MotionTokenizer]] = {
-    "verlet": VerletTokenizer,
-    "k_disks": lambda: KDisksTokenizer.of(torch.rand(5, 30, 5, 3)),
-}
+from tests.dpa.families import families, families_and_tokens, smallest
 
 
 @pytest.fixture(scope="module")
@@ -55,11 +47,6 @@ def module_there(mode: FakeTensorMode, module: nn.Module) -> nn.Module:
     return module
 
 
-def policy(family: str, tokenizer: MotionTokenizer) -> MotionModel:
-    config = {"family": family, "model": size_of(family, SMALLEST[family]), "context": {}}
-    return build_model(config, tokenizer)
-
-
 @pytest.fixture
 def batch(scene: Callable, elsewhere: FakeTensorMode) -> Callable[..., TensorDict]:
     """Makes a batch of two scenes for a loss, there."""
@@ -83,42 +70,49 @@ def test_the_device_is_one_that_tells_mistakes(elsewhere: FakeTensorMode) -> Non
             there.sum().item()
 
 
-TOKENS, VALID = torch.zeros(2, 3, 5, 16, dtype=torch.int64), torch.ones(2, 1, 5, 16, dtype=torch.bool)
+VALID = torch.ones(2, 1, 5, 16, dtype=torch.bool)
 
 
-@families
-@pytest.mark.parametrize("make_tokenizer", TOKENIZERS.values(), ids=TOKENIZERS)
+def tokens_for(model: MotionModel) -> Tensor:
+    """``[2, 3, 5, 16, ...]``."""
+    return torch.zeros(2, 3, 5, 16, *model.tokenizer.shape, dtype=model.tokenizer.dtype)
+
+
+@families_and_tokens
 def test_a_pass_and_its_gradients_stay_on_the_device(
     family: str, make_tokenizer: Callable, batch: Callable, elsewhere: FakeTensorMode
 ) -> None:
-    model = policy(family, make_tokenizer())
-    given = batch(model, tokens=TOKENS, valid=VALID)
+    model = smallest(family, make_tokenizer())
+    given = batch(model, tokens=tokens_for(model), valid=VALID)
     there = module_there(elsewhere, model)
     with elsewhere:
         logits = there(given["context"], given["tokens"], given["valid"])
-        assert logits.device.type == DEVICE and logits.shape == (2, 3, 5, 16, model.tokenizer.vocab_size)
+        assert logits.device.type == DEVICE and logits.shape[:4] == (2, 3, 5, 16)
         logits.sum().backward()
     assert all(parameter.grad.device.type == DEVICE for parameter in there.parameters() if parameter.grad is not None)
 
 
-LOSSES: dict[str, tuple[Callable, dict[str, Tensor]]] = {
-    "next token": (NextTokenLoss, {"tokens": TOKENS[:, :1], "labels": TOKENS[:, :1], "token_valid": VALID}),
-    "pairs": (ContrastivePreferenceLoss, {"preferred": TOKENS, "unpreferred": TOKENS, "token_valid": VALID}),
+LOSSES: dict[str, tuple[Callable, Callable[[Tensor], dict[str, Tensor]]]] = {
+    "next token": (NextTokenLoss, lambda tokens: {"tokens": tokens[:, :1], "labels": tokens[:, :1]}),
+    "pairs": (ContrastivePreferenceLoss, lambda tokens: {"preferred": tokens, "unpreferred": tokens}),
     "policy gradient": (
         PolicyGradientLoss,
-        {"tokens": TOKENS, "token_valid": VALID, "advantage": torch.zeros(2, 3, 5, 16),
-         "sample_log_prob": torch.zeros(2, 3, 5, 16)},
+        lambda tokens: {
+            "tokens": tokens,
+            "advantage": torch.zeros(2, 3, 5, 16),
+            "sample_log_prob": torch.zeros(2, 3, 5, 16),
+        },
     ),
-}  # fmt: skip
+}
 
 
 @families
 @pytest.mark.parametrize(("make_loss", "entries"), LOSSES.values(), ids=LOSSES)
 def test_losses_stay_on_the_device(
-    family: str, make_loss: Callable, entries: dict, batch: Callable, elsewhere: FakeTensorMode
+    family: str, make_loss: Callable, entries: Callable, batch: Callable, elsewhere: FakeTensorMode
 ) -> None:
-    model = policy(family, VerletTokenizer())
-    given = batch(model, **entries)
+    model = smallest(family)
+    given = batch(model, token_valid=VALID, **entries(tokens_for(model)))
     there = module_there(elsewhere, model)
     with elsewhere:
         found = make_loss(token_network(there))(given)
@@ -131,19 +125,21 @@ def test_losses_stay_on_the_device(
 def test_a_decision_of_running_rollouts_stays_on_the_device(
     family: str, batch: Callable, elsewhere: FakeTensorMode
 ) -> None:
-    model, shape = policy(family, VerletTokenizer()).eval(), (6, 5)
+    model, shape = smallest(family).eval(), (6, 5)
     given = batch(model)
     there = module_there(elsewhere, model)
     with elsewhere, torch.no_grad():
         memory = there.remember()
         memory.begin(given["context"], 3, anew=True)
-        whole = {"dtype": torch.int64, "device": DEVICE}
+        whole, tokenizer = {"dtype": torch.int64, "device": DEVICE}, model.tokenizer
+        last = (*shape, *tokenizer.shape)
         for _ in range(2):
             seen = Observation(
-                torch.empty(*shape, 6, 3, device=DEVICE), torch.empty(shape, **whole), torch.empty(6, **whole), 1,
-                torch.empty(shape, **whole), torch.empty(shape, dtype=torch.bool, device=DEVICE),
+                torch.empty(*shape, 6, 3, device=DEVICE), torch.empty(last, dtype=tokenizer.dtype, device=DEVICE),
+                torch.empty(6, **whole), 1, torch.empty(shape, **whole),
+                torch.empty(shape, dtype=torch.bool, device=DEVICE),
             )  # fmt: skip
-            decision = memory.step(seen, lambda logits, agents=None: logits.argmax(-1))
+            decision = memory.step(seen, lambda logits, agents=None: model.distribution.likeliest(logits))
             assert decision.logits.device.type == decision.token.device.type == DEVICE
 
 

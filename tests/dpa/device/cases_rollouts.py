@@ -12,8 +12,7 @@ from torchrl.envs import TransformedEnv
 
 from dpa.models import Contexts, MotionActor, MotionModel
 from dpa.models.closest import ClosestActor
-from dpa.models.registry import build_model, size_of
-from dpa.tokens import KDisksTokenizer, MotionTokenizer, TokenAction, VerletTokenizer
+from dpa.tokens import MotionTokenizer, TokenAction, VerletTokenizer
 from envs import keys
 from envs.episode import EpisodeOptions
 from envs.rewards import SignalReward
@@ -21,21 +20,11 @@ from envs.scene import Scene
 from envs.signals import SIGNALS
 from envs.traffic import TrafficEnv
 from recipes.benchmark.pretended import DEVICE, Pretended
+from tests.dpa.families import TOKENIZERS, families_and_tokens, smallest
 
-SMALLEST = {"motionlm": "nano", "smart": "nano"}
-families = pytest.mark.parametrize("family", sorted(SMALLEST))
 SCENES, ROLLOUTS = 2, 3
 FREE = sorted(set(SIGNALS) - {"red_light"})
 """Signals for which no decision waits; that of red lights asks which vehicles pass one."""
-TOKENIZERS: dict[str, Callable[[], MotionTokenizer]] = {
-    "verlet": VerletTokenizer,
-    "k_disks": lambda: KDisksTokenizer.of(torch.rand(5, 30, 5, 3, generator=torch.Generator().manual_seed(0))),
-}
-
-
-def policy(family: str, tokenizer: MotionTokenizer) -> MotionModel:
-    torch.manual_seed(0)
-    return build_model({"family": family, "model": size_of(family, SMALLEST[family]), "context": {}}, tokenizer).eval()
 
 
 def environment(scenes: list[Scene], device: str, tokenizer: MotionTokenizer, **options: object) -> TransformedEnv:
@@ -73,12 +62,11 @@ def assert_same(here: TensorDictBase, there: TensorDictBase) -> None:
         torch.testing.assert_close(other.cpu(), value, rtol=0, atol=0 if exact else 1e-6, msg=str(key))
 
 
-@families
-@pytest.mark.parametrize("make_tokenizer", TOKENIZERS.values(), ids=TOKENIZERS)
+@families_and_tokens
 def test_rollouts_are_those_of_the_cpu_and_a_decision_reads_back_once(
     family: str, make_tokenizer: Callable, scene: Callable[..., Scene]
 ) -> None:
-    scenes, model, heard = [scene(4, seed=0), scene(3, seed=1)], policy(family, make_tokenizer()), []
+    scenes, model, heard = [scene(4, seed=0), scene(3, seed=1)], smallest(family, make_tokenizer()).eval(), []
     with torch.no_grad():
         want = driven(scenes, model, "cpu", 5)
         with Pretended() as count:
@@ -97,7 +85,7 @@ def test_rollouts_are_those_of_the_cpu_and_a_decision_reads_back_once(
 
 
 def test_signals_are_those_of_the_cpu_and_no_step_waits_for_them(scene: Callable[..., Scene]) -> None:
-    scenes, model = [scene(4, seed=0), scene(3, seed=1)], policy("motionlm", VerletTokenizer())
+    scenes, model = [scene(4, seed=0), scene(3, seed=1)], smallest("motionlm").eval()
     waits = {}
     with torch.no_grad():
         want = driven(scenes, model, "cpu", 4, signals=tuple(SIGNALS))
@@ -134,11 +122,9 @@ def test_rows_that_begin_again_alone_do_so_on_the_device(scene: Callable[..., Sc
             assert_same(want, again(DEVICE))
 
 
-@pytest.mark.parametrize("make_tokenizer", TOKENIZERS.values(), ids=TOKENIZERS)
-def test_a_policy_that_stays_near_the_log_does_so_on_the_device(
-    make_tokenizer: Callable, scene: Callable[..., Scene]
-) -> None:
-    scenes, model = [scene(4, seed=0)], policy("motionlm", make_tokenizer())
+@pytest.mark.parametrize("spoken", ["verlet", "k_disks"])
+def test_a_policy_that_stays_near_the_log_does_so_on_the_device(spoken: str, scene: Callable[..., Scene]) -> None:
+    scenes, model = [scene(4, seed=0)], smallest("motionlm", TOKENIZERS[spoken]()).eval()
 
     def followed(device: str) -> TensorDictBase:
         moved = deepcopy(model).to(device)

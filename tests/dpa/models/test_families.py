@@ -15,29 +15,17 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from dpa.models import Contexts, MotionActor, MotionModel, collate_contexts, make_context
 from dpa.models.context import keep_agents, pad_context
-from dpa.models.registry import FAMILIES, build_model, size_of
-from dpa.tokens import KDisksTokenizer, MotionTokenizer, PatchTokenizer, TokenAction, VerletTokenizer
+from dpa.tokens import KDisksTokenizer, MotionTokenizer, TokenAction
 from envs import keys
 from envs.episode import EpisodeOptions
 from envs.scene import Scene
 from envs.traffic import TrafficEnv
-
-SMALLEST = {"behaviorgpt": "nano", "motionlm": "nano", "smart": "nano", "trajeglish": "nano"}
-PATCHES = ("behaviorgpt",)
-"""Families that predict poses and no tokens of a vocabulary."""
-families = pytest.mark.parametrize("family", sorted(SMALLEST))
-families_of_tokens = pytest.mark.parametrize("family", sorted(set(SMALLEST) - set(PATCHES)))
-
-
-def tokens_of(family: str, steps: int = 5) -> MotionTokenizer:
-    return PatchTokenizer(steps) if family in PATCHES else VerletTokenizer(steps=steps)
+from tests.dpa.families import families, families_of_tokens, smallest, tokens_of
 
 
 def make(family: str, tokenizer: MotionTokenizer | None = None, horizon: int = 16) -> MotionModel:
     """A small policy whose parameters are all non-zero."""
-    torch.manual_seed(0)
-    size = size_of(family, SMALLEST[family]) | {"horizon": horizon}
-    model = build_model({"family": family, "model": size, "context": {}}, tokenizer or tokens_of(family)).eval()
+    model = smallest(family, tokenizer, horizon).eval()
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for parameter in model.parameters():
@@ -230,10 +218,6 @@ def test_rows_may_stand_at_different_decisions_of_scenes_of_different_size(famil
         expected = forced(model, played, EpisodeOptions(), part)
         written = part[keys.LOG_PROB].transpose(1, 2)
         torch.testing.assert_close(written[controlled], expected[controlled], atol=1e-5, rtol=0)
-
-
-def test_every_family_is_tested() -> None:
-    assert set(FAMILIES) - {"habit"} == set(SMALLEST)
 
 
 if __name__ == "__main__":
