@@ -152,7 +152,9 @@ class PolicyGradientLoss(LossModule):
         advantage = tensordict[accepted.advantage]
         if self.clip is None:
             return advantage * log_prob, {}
-        ratio = (log_prob - tensordict[accepted.sample_log_prob]).exp()
+        valid = tensordict[accepted.token_valid]
+        # A density of what does not count may be anything, and the gradient of its ratio no number.
+        ratio = torch.where(valid, log_prob - tensordict[accepted.sample_log_prob], 0.0).exp()
         free, held = advantage * ratio, advantage * ratio.clamp(1 - self.clip, 1 + self.clip)
-        share = masked_mean((held < free).to(ratio.dtype), tensordict[accepted.token_valid])
+        share = masked_mean((held < free).to(ratio.dtype), valid)
         return torch.minimum(free, held), {"clip_fraction": share}

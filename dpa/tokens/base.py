@@ -132,7 +132,7 @@ class MotionTokenizer(nn.Module):
             tokens.append(self._noisy(labels[-1], kind, noise, drawn[..., step, :]) if noise else labels[-1])
             recent = self.advance(tokens[-1], recent, kind)
             tracks.append(recent[..., 1:, :])
-        together = (torch.stack(each, kind.dim()) for each in (tokens, labels))
+        together = (torch.stack(each, -1 - len(self.shape)) for each in (tokens, labels))
         return TokenizedTracks(next(together), token_valid, torch.cat(tracks, -2), next(together))
 
     def alike(self, one: Tensor, other: Tensor) -> Tensor:
@@ -173,7 +173,7 @@ class MotionTokenizer(nn.Module):
             ``[*, A, T * F, 3]`` in the frame of ``recent``.
         """
         tracks = []
-        for token in tokens.unbind(kind.dim()):
+        for token in tokens.unbind(-1 - len(self.shape)):
             recent = self.advance(token, recent, kind)
             tracks.append(recent[..., 1:, :])
         return torch.cat(tracks, -2)

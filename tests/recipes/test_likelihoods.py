@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from dpa.models import make_context
+from dpa.models.distribution import TOKENS
 from dpa.models.motionlm import MotionLM, SceneContext, featurize
 from dpa.tokens import VerletTokenizer
 from envs.episode import EpisodeOptions
@@ -21,6 +22,8 @@ V = 4
 
 class Steady(nn.Module):
     """The same distribution over tokens everywhere."""
+
+    distribution = TOKENS
 
     def __init__(self, probabilities: list[float]) -> None:
         super().__init__()

@@ -215,7 +215,7 @@ def test_options_that_make_no_sense_are_refused(
         ("++logger.entity=me", ("logger has no option 'entity'; it takes backend, mode",)),
         ("+pretraining.augmentation.flip=1", ("pretraining.augmentation has no option 'flip'",)),
         ("model.size=huge", ("model.size must be one of", "huge")),
-        ("model.tokenizer.name=patches", ("model.tokenizer.name must be one of", "patches")),
+        ("model.tokenizer.name=syllables", ("model.tokenizer.name must be one of", "syllables")),
         ("+model.context.depth=3", ("model.context has no option 'depth'",)),
         ("model.episode.horizon=17", ("horizon * decision_steps must be at most 80 steps", "17 * 5")),
         ("model.context.max_pieces=0", ("model.context.max_pieces must be 1 or more, got 0",)),
