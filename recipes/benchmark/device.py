@@ -28,6 +28,7 @@ from envs.traffic import TrafficEnv
 from recipes.benchmark.counting import DeviceCount
 from recipes.benchmark.pretended import DEVICE, Pretended
 from recipes.benchmark.realism import crowded_scene
+from recipes.benchmark.rollout import episode_of
 from recipes.common.models import named_model, named_models
 
 SEGMENTS = 500
@@ -94,15 +95,13 @@ def counted(
         scenes: side by side.
         signals: that the environment computes.
     """
-    policy, source = (
-        named_model(model).to(count.device).eval(),
-        [crowded_scene(agents, SEGMENTS, i) for i in range(scenes)],
-    )
-    sizes = {"num_scenes": scenes, "num_rollouts": rollouts}
-    env = TransformedEnv(
-        TrafficEnv(source, **sizes, signals=signals, device=count.device), TokenAction(policy.tokenizer)
-    )
-    actor = MotionActor(policy, Contexts(source, policy.featurize), num_rollouts=rollouts, decoding=Decoding())
+    policy = named_model(model).to(count.device).eval()
+    source = [crowded_scene(agents, SEGMENTS, index) for index in range(scenes)]
+    episode, sizes = episode_of(policy), {"num_scenes": scenes, "num_rollouts": rollouts}
+    env = TrafficEnv(source, episode, **sizes, signals=signals, device=count.device)
+    env = TransformedEnv(env, TokenAction(policy.tokenizer))
+    contexts = Contexts(source, policy.featurize, episode)
+    actor = MotionActor(policy, contexts, num_rollouts=rollouts, decoding=Decoding())
     rows: list[dict[str, Any]] = []
 
     def tell(part: str, work: Callable[[], TensorDictBase], share: int = 1) -> TensorDictBase:

@@ -36,6 +36,7 @@ from dpa.training.batches import collate_items
 from dpa.training.logs import log_item
 from envs import keys
 from envs.allocator import keep_freed_memory
+from envs.episode import EpisodeOptions
 from envs.progress import progress
 from envs.scene import Scene
 from envs.traffic import TrafficEnv
@@ -189,13 +190,18 @@ def run(case: Case) -> dict[str, float]:
     return {"seconds": seconds, "agent_steps_per_second": case.agent_steps / seconds, "gib": gib}
 
 
+def episode_of(model: MotionModel) -> EpisodeOptions:
+    """Episodes whose decisions last as long as the policy's tokens."""
+    return EpisodeOptions(decision_steps=model.tokenizer.steps, horizon=model.config.horizon)
+
+
 def _bare(case: Case, model: MotionModel, scenes: list[Scene]) -> Callable[[], object]:
     """Environment and policy called in turn, and nothing kept."""
-    env = TrafficEnv(scenes, num_scenes=case.scenes, num_rollouts=case.rollouts, device=case.device)
+    env = TrafficEnv(scenes, episode_of(model), num_scenes=case.scenes, num_rollouts=case.rollouts, device=case.device)
     driven = TransformedEnv(env, TokenAction(model.tokenizer))
     kind = {"naive": NaiveActor, "uncached": UncachedActor}.get(case.how, MotionActor)
     options = {"num_rollouts": case.rollouts, "decoding": Decoding(), "compile": case.how == "compiled"}
-    actor = kind(model, Contexts(scenes, model.featurize), **options)
+    actor = kind(model, Contexts(scenes, model.featurize, episode_of(model)), **options)
 
     def episode() -> None:
         state = driven.reset()
@@ -208,7 +214,8 @@ def _bare(case: Case, model: MotionModel, scenes: list[Scene]) -> Callable[[], o
 def _collected(case: Case, model: MotionModel, scenes: list[Scene]) -> Callable[[], object]:
     """What recipes do: environment, policy and collector made anew for each task."""
     rank = partial(RankRollouts, num_rollouts=case.rollouts) if case.how == "ranked" else None
-    worker = RolloutWorker(RolloutJob(scenes, model, case.rollouts, device=case.device, make_postproc=rank))
+    options = {"options": episode_of(model), "device": case.device, "make_postproc": rank}
+    worker = RolloutWorker(RolloutJob(scenes, model, case.rollouts, **options))
     task = RolloutTask(tuple(range(case.scenes)), (range(case.rollouts),))
     return lambda: worker.run(task)
 
@@ -217,9 +224,8 @@ def _trained(case: Case, model: MotionModel, scenes: list[Scene]) -> Callable[[]
     """Loss and gradients of the logs of all scenes."""
     loss = NextTokenLoss(token_network(model.train()))
     tokenizer = model.tokenizer.on_cpu()
-    batch = collate_items([log_item(make_context(scene, model.featurize), tokenizer) for scene in scenes]).to(
-        case.device
-    )
+    contexts = [make_context(scene, model.featurize, episode_of(model)) for scene in scenes]
+    batch = collate_items([log_item(context, tokenizer) for context in contexts]).to(case.device)
     return lambda: sum(value for key, value in loss(batch).items() if key.startswith("loss_")).backward()
 
 
