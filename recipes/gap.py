@@ -26,7 +26,6 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from dpa.models import Decoding, MotionModel, collate_contexts, make_context
-from dpa.models.sampling import draw
 from dpa.realism import RealismConfig
 from dpa.realism.features import measure
 from dpa.realism.tracks import compare
@@ -80,14 +79,13 @@ def single_decisions(
         with torch.no_grad():
             batch = collate_contexts([context]).to(cfg.device)
             seen = (each.to(cfg.device) for each in (tracks.tokens[None, None], tracks.valid[None, None]))
-            log_probs = decoding.log_probs(model(batch, *seen).float())[0, 0].cpu()  # [A, T, V]
-        uniform = torch.rand(
-            cfg.num_rollouts, *log_probs.shape[:-1], generator=make_generator(cfg.seed, "gap", scene.scene_id)
-        )
-        tokens = draw(log_probs.expand(cfg.num_rollouts, *log_probs.shape), uniform)
+            logits = model(batch, *seen).float()[0, 0].cpu()  # [A, T, P]
+        shape, draw = (cfg.num_rollouts, *logits.shape[:-1]), make_generator(cfg.seed, "gap", scene.scene_id)
+        uniform = torch.rand(*shape, model.distribution.numbers, generator=draw)
+        tokens, _ = model.distribution.draw(logits.expand(*shape, -1), uniform, decoding)
         before = torch.cat((episode.recent, tracks.poses), 1).unfold(1, tokenizer.steps + 1, tokenizer.steps)
-        before = before.movedim(-1, -2)[:, : tokens.shape[-1]].expand(*tokens.shape, -1, -1)
-        kind = episode.kind[:, None].expand_as(tokens)
+        before = before.movedim(-1, -2)[:, : shape[2]].expand(*shape, -1, -1)
+        kind = episode.kind[:, None].expand(shape)
         moved = to_world(tokenizer.decode(tokens, before, kind), before[..., -1:, :]).flatten(2, 3)
         yield index, lifted(scene, torch.where(episode.controlled[:, None, None], moved, episode.logged))
 

@@ -68,8 +68,9 @@ def rungs(cfg: DictConfig, scenes: SceneSource) -> Iterator[tuple[str, dict[str,
         "log through tokens": tokenized_log(untrained.tokenizer),
         "noisy log": noisy_log,
         "constant velocity": constant_velocity,
-        "random tokens": random_tokens(untrained.tokenizer),
     }
+    if untrained.tokenizer.vocab_size:
+        made["random tokens"] = random_tokens(untrained.tokenizer)
     for name, rung in made.items():
         yield name, {"tokenizer": config["tokenizer"]}, crude(scenes, rung, count, seed)
     for name, (model, episode, config) in models.items():

@@ -122,7 +122,8 @@ def main(cfg: DictConfig) -> None:
         table.add_row(name, *(f"{value:.3f}" if isinstance(value, float) else str(value) for value in row.values()))
     Console(markup=False).print(table)
     left = realism_table(realism_left(scenes, model.tokenizer, RealismConfig.load(str(cfg.metric))))
-    realistic = Table("", *BUCKETS, title=f"realism, {len(scenes)} scenes, {model.tokenizer.vocab_size} tokens")
+    spoken = f"{model.tokenizer.vocab_size} tokens" if model.tokenizer.vocab_size else "patches"
+    realistic = Table("", *BUCKETS, title=f"realism, {len(scenes)} scenes, {spoken}")
     for name, row in left.items():
         realistic.add_row("log through tokens" if name == "tokens" else name, *(f"{row[key]:.3f}" for key in BUCKETS))
     Console(markup=False).print(realistic)

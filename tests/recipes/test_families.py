@@ -51,6 +51,20 @@ def test_it_is_aligned_and_evaluated(
     assert 0 < json.loads((tmp_path / "scores.json").read_text())["mean"]["realism"] < 1
 
 
+def test_it_is_taken_apart_watched_and_set_beside_others(
+    trained: SimpleNamespace, run: Callable, options: Callable, tmp_path: Path
+) -> None:
+    chosen, policies = f"model={trained.model}", f"policies={trained.policy}"
+    for recipe, told in (
+        ("gap", [policies, f"output={tmp_path / 'gap'}"]),
+        ("ladder", [chosen, policies, f"output={tmp_path / 'ladder'}"]),
+        ("tokens", [chosen, f"json={tmp_path / 'tokens.json'}"]),
+        ("play", [policies, f"output={tmp_path / 'film.html'}"]),
+    ):
+        outcome = run(recipe, *options(recipe, *told))
+        assert outcome.status == 0, (recipe, outcome.err)
+
+
 def test_its_rankings_hold_its_patches(trained: SimpleNamespace) -> None:
     group = PreferenceStore(trained.ranked)[0]
     assert group[keys.TOKENS].shape[3:] == (8, 30) and group[keys.TOKENS].dtype == torch.float32
