@@ -183,16 +183,14 @@ class MotionActor(TensorDictModuleBase):
             raise ValueError(f"num_rollouts must divide the batch of {shape[0]} rows, got {self.num_rollouts}.")
         self._check_order(at)
         if 1 in at:
-            self._count(tensordict[keys.SCENE].tolist(), at)
+            self._count(at)
         if 0 not in at:
             return
         scene, begins = tensordict[keys.SCENE].tolist(), [row for row, each in enumerate(at) if each == 0]
         anew = self._last is None or self._last.shape[:2] != shape or len(begins) == len(at)
         if anew:
-            tokenizer, numbers = self.model.tokenizer, self.model.distribution.numbers
-            whole = (*shape, *tokenizer.shape)
-            self._last = torch.full(whole, self.model.no_token, dtype=tokenizer.dtype, device=step.device)
-            self._noise = torch.zeros(shape[0], self.model.config.horizon, shape[1], numbers)
+            self._last = self.model.no_tokens(shape, step.device)
+            self._noise = torch.zeros(shape[0], self.model.config.horizon, shape[1], self.model.distribution.numbers)
             begins = list(range(len(at)))
             self._scenes = scene[:: self.num_rollouts]
         # Padding depends on the scenes of a batch, so a change of some encodes all: rare, and cheap beside the episode.
@@ -225,10 +223,11 @@ class MotionActor(TensorDictModuleBase):
                     "both the same scenes, arrivals, decision_steps and horizon."
                 )
 
-    def _count(self, scene: list[int], at: list[int]) -> None:
+    def _count(self, at: list[int]) -> None:
         """An episode has begun when it takes its second decision: a collector may try a policy out on the first one."""
         for row in (row for row, each in enumerate(at) if each == 1):
-            named = (scene[row], self.first_rollout + row % self.num_rollouts)
+            group, number = divmod(row, self.num_rollouts)
+            named = (self._scenes[group], self.first_rollout + number)
             self._begun[named] = self._begun.get(named, 0) + 1
 
     def _draw_noise(self, rows: list[int], scene: list[int]) -> None:

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
+import torch
 from torch import Tensor, nn
 
 from dpa.models.context import Context, Featurize
@@ -113,6 +114,11 @@ class MotionModel(nn.Module, ABC):
     def no_token(self) -> int:
         """Stands for the last token, or each of its numbers, of an agent that has none: V."""
         return self.tokenizer.vocab_size
+
+    def no_tokens(self, shape: tuple[int, ...], device: torch.device) -> Tensor:
+        """Tokens of agents ``shape`` that have none: ``[*, ...]``."""
+        tokenizer = self.tokenizer
+        return torch.full((*shape, *tokenizer.shape), self.no_token, dtype=tokenizer.dtype, device=device)
 
     @property
     @abstractmethod

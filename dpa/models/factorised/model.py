@@ -151,7 +151,7 @@ class FactorisedModel(MotionModel):
 
         decisions = early.shape[1] + horizon
         recent, valid = behind(early, shown.recent), behind(there, shown.valid)
-        token = behind(self._no_tokens(there), shown.token)
+        token = behind(self.no_tokens(there.shape, there.device), shown.token)
         kind = context.episode.kind.repeat_interleave(rollouts * decisions, 0)
         x = self.embed(recent, token, kind, context.episode.extent.repeat_interleave(rollouts * decisions, 0))
         pose, pieces, x = recent[:, :, -1], self.read_map(context), x.flatten(0, 1)
@@ -178,11 +178,6 @@ class FactorisedModel(MotionModel):
         decisions = poses.unfold(2, steps + 1, steps)[:, :, :count].movedim(-1, -2)  # [S, A, H, F + 1, 3]
         ends = seen.unfold(2, steps + 1, steps)[:, :, :count]
         return decisions.transpose(1, 2), (ends[..., 0] & ends[..., -1] & episode.valid[..., None]).transpose(1, 2)
-
-    def _no_tokens(self, like: Tensor) -> Tensor:
-        """Of decisions ``[*]`` that the log took: ``[*, ...]``."""
-        shape = (*like.shape, *self.tokenizer.shape)
-        return torch.full(shape, self.no_token, dtype=self.tokenizer.dtype, device=like.device)
 
     def _edges(
         self, embed: FourierEmbedding, pose: Tensor, others: Tensor, mask: Tensor, most: int, radius: float
@@ -292,7 +287,7 @@ class FactorisedMemory:
         past = Past(keys, like.new_zeros(*shape, 3), torch.zeros(shape, dtype=torch.bool, device=like.device))
         early, there = self.model.history(context)
         for recent, valid in zip(early.unbind(1), there.unbind(1), strict=True):
-            token, first = self.model._no_tokens(episode.kind), torch.zeros_like(episode.kind[:, 0])
+            token, first = self.model.no_tokens(episode.kind.shape, valid.device), torch.zeros_like(episode.kind[:, 0])
             seen = Observation(recent, token, first, 0, episode.kind, valid)
             _, past = self._advance(past, seen, episode.extent)
         return past

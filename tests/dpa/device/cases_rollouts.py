@@ -79,8 +79,8 @@ def test_rollouts_are_those_of_the_cpu_and_a_decision_reads_back_once(
             for here, there in zip(want, got, strict=True):
                 assert_same(here, there)
     policies, steps = ([each for each in heard if each[0] == what] for what in ("policy", "env step"))
-    # The first decision looks at the scenes; the second also reads which scenes have begun.
-    assert policies[2:] == [("policy", {"_to_copy": 1}, 0)] * 3
+    # The first decision looks at the scenes.
+    assert policies[1:] == [("policy", {"_to_copy": 1}, 0)] * 4
     assert steps == [("env step", {}, 0)] * 5
 
 

@@ -1,4 +1,4 @@
-"""Every family of the package goes through everything that a recipe does, by its name alone."""
+"""A policy whose actions are poses, and no tokens of a vocabulary, goes through everything that a recipe does."""
 
 from __future__ import annotations
 
@@ -14,21 +14,20 @@ from dpa.preferences import PreferenceStore
 from dpa.training.checkpoint import load_policy
 from envs import keys
 
-FAMILIES = ("behaviorgpt_nano",)
-families = pytest.mark.parametrize("family", FAMILIES)
+MODEL = "behaviorgpt_nano"
 
 
-@pytest.fixture(scope="module", params=FAMILIES)
-def trained(request: pytest.FixtureRequest, run: Callable, options: Callable, tmp_path_factory) -> SimpleNamespace:
-    """A policy of a family that has hardly learnt anything, and rankings of its rollouts."""
-    folder, chosen = tmp_path_factory.mktemp(request.param), f"model={request.param}"
+@pytest.fixture(scope="module")
+def trained(run: Callable, options: Callable, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """A policy that has hardly learnt anything, and rankings of its rollouts."""
+    folder, chosen = tmp_path_factory.mktemp(MODEL), f"model={MODEL}"
     for recipe, told in (
         ("pretrain", [chosen, f"output={folder}"]),
         ("collect", [f"policy={folder / 'policy.pt'}", f"output={folder / 'ranked'}"]),
     ):
         outcome = run(recipe, *options(recipe, *told))
         assert outcome.status == 0, outcome.err
-    return SimpleNamespace(model=request.param, policy=folder / "policy.pt", ranked=folder / "ranked")
+    return SimpleNamespace(policy=folder / "policy.pt", ranked=folder / "ranked")
 
 
 @pytest.mark.parametrize(
@@ -54,7 +53,7 @@ def test_it_is_aligned_and_evaluated(
 def test_it_is_taken_apart_watched_and_set_beside_others(
     trained: SimpleNamespace, run: Callable, options: Callable, tmp_path: Path
 ) -> None:
-    chosen, policies = f"model={trained.model}", f"policies={trained.policy}"
+    chosen, policies = f"model={MODEL}", f"policies={trained.policy}"
     for recipe, told in (
         ("gap", [policies, f"output={tmp_path / 'gap'}"]),
         ("ladder", [chosen, policies, f"output={tmp_path / 'ladder'}"]),
@@ -80,7 +79,6 @@ def test_a_method_that_needs_a_vocabulary_is_refused_in_one_sentence(
     assert "CAT-K follows the log by a policy's own most probable tokens, and patches have none" in outcome.err
 
 
-@families
 @pytest.mark.parametrize(
     ("told", "message"),
     [
@@ -89,9 +87,9 @@ def test_a_method_that_needs_a_vocabulary_is_refused_in_one_sentence(
     ],
 )
 def test_an_option_that_needs_a_vocabulary_is_refused(
-    family: str, told: list, message: str, run: Callable, options: Callable, tmp_path: Path
+    told: list, message: str, run: Callable, options: Callable, tmp_path: Path
 ) -> None:
-    outcome = run("pretrain", *options("pretrain", f"model={family}", *told, f"output={tmp_path}"))
+    outcome = run("pretrain", *options("pretrain", f"model={MODEL}", *told, f"output={tmp_path}"))
     assert outcome.status == 2 and message in outcome.err, outcome.err
 
 
