@@ -146,6 +146,7 @@ class TurnDecoder(NodeDecoder):
         layers: decoder layers.
         horizon: T.
         past: decisions that a node looks back.
+        joint: a node sees those of the turns before its own in the same decision.
         dropout: on every branch.
     """
 
@@ -158,10 +159,11 @@ class TurnDecoder(NodeDecoder):
         layers: int,
         horizon: int,
         past: int,
+        joint: bool = True,
         dropout: float = 0.0,
     ) -> None:
         super().__init__(vocab_size, width, heads, feed, layers, horizon, dropout, TurnAttention)
-        self.past = past
+        self.past, self.joint = past, joint
         self.chosen = nn.Parameter(torch.zeros(width))
 
     def embed(self, recent: Tensor, token: Tensor, extent: Tensor, who: Tensor) -> Tensor:
@@ -215,7 +217,8 @@ class TurnDecoder(NodeDecoder):
             last, start = min(first + DECISIONS, horizon), max(first - self.past, 0)
             queries, before = slice(first * turns, last * turns), slice(start * turns, last * turns)
             mine, theirs = node[queries, None], node[before]
-            near = (theirs <= mine) & (mine // turns - theirs // turns <= self.past)
+            ago = mine // turns - theirs // turns
+            near = (theirs <= mine) & (ago <= self.past) & ((ago > 0) | (theirs == mine) | self.joint)
             nodes = near & (there[:, None, start:last].flatten(2) | (theirs == mine))
             same = torch.eye(last - first, dtype=torch.bool, device=there.device)
             others = seen[:, first:last, :, None] & same[:, None, :, None]  # [B, decisions, C, decisions, A + C]

@@ -113,6 +113,12 @@ class TurnMemory:
             padded = ((F.pad(now, (0, 0, 0, 2 * turns)), before.flatten(2, 3)) for now, before in parts)
             self._layers.append(KeyValues(*(torch.cat(both, 2) for both in padded)))
 
+    @property
+    def _deciding(self) -> Tensor:
+        """``[B, C]`` bool, the agent is there and takes its turn."""
+        turns = self._cast.takes.shape[1]
+        return self._cast.takes & self._shown.valid[:, :turns]
+
     def _decide(self, turn: int) -> Tensor:
         """``[B, 1, V]`` logits of a turn, whose node is there for those to come."""
         decoder, (turns, agents) = self.model.decoder, self._counts
@@ -139,7 +145,7 @@ class TurnMemory:
         self._agents.x[:, agents + turn], self._agents.pose[:, agents + turn] = x[:, 0], pose[:, 0]
         for layer, held in zip(decoder.layers, self._layers, strict=True):
             _write(held, agents + turn, layer.remember(x, pose))
-        there = cast.takes[:, turn] & self._shown.valid[:, turn]
+        there = self._deciding[:, turn] & self.model.config.joint
         self._see[:, agents + turn] = self._see[:, agents + turns + turn] = there
         self._see[:, turn] &= ~there
 
@@ -151,7 +157,7 @@ class TurnMemory:
             parts = zip(held, past, strict=True)
             later = (torch.cat((new[:, :, None, now], before[:, :, :-1]), 2) for new, before in parts)
             layers.append(KeyValues(*later))
-        there = torch.cat((self._see[:, None, now], self._past.there[:, :-1]), 1)
+        there = torch.cat((self._deciding[:, None], self._past.there[:, :-1]), 1)
         self._past = Past(tuple(layers), there)
 
 

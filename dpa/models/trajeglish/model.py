@@ -32,6 +32,8 @@ class TrajeglishConfig:
         encoder_layers: self-attention layers over the scene.
         decoder_layers: layers of attention to turns, agents and scene.
         past: decisions that a turn looks back.
+        joint: agents know what those before them in the same decision have chosen. Without, they know it from the
+            next decision on, as in eq. 1: what taking turns is worth.
         horizon: T, decisions in an episode.
         dropout: on every branch.
     """
@@ -42,12 +44,14 @@ class TrajeglishConfig:
     encoder_layers: int
     decoder_layers: int
     past: int = 10
+    joint: bool = True
     horizon: int = 16
     dropout: float = 0.0
 
 
 SIZES: dict[str, TrajeglishConfig] = {
     "nano": TrajeglishConfig(width=48, heads=3, feed=192, encoder_layers=1, decoder_layers=2),
+    "nano_apart": TrajeglishConfig(width=48, heads=3, feed=192, encoder_layers=1, decoder_layers=2, joint=False),
     "35m": TrajeglishConfig(width=512, heads=8, feed=2048, encoder_layers=2, decoder_layers=6, past=20),
 }
 """Named sizes; ``35m`` has the parameters published, within 10 %, with a vocabulary of 384."""
@@ -87,7 +91,13 @@ class Trajeglish(MotionModel):
         size = (config.width, config.heads, config.feed)
         self.encoder = SceneEncoder(*size, config.encoder_layers, config.dropout)
         self.decoder = TurnDecoder(
-            tokenizer.vocab_size, *size, config.decoder_layers, config.horizon, config.past, config.dropout
+            tokenizer.vocab_size,
+            *size,
+            config.decoder_layers,
+            config.horizon,
+            config.past,
+            config.joint,
+            config.dropout,
         )
 
     @property
@@ -155,5 +165,5 @@ class Trajeglish(MotionModel):
         )
         kind = cast.kind[:, None, :turns].expand_as(chosen)
         recent = self.tokenizer.advance(chosen, shown.recent[:, :, :turns], kind)
-        valid = valid & cast.takes[:, None] & shown.valid[:, :, :turns]
+        valid = valid & cast.takes[:, None] & shown.valid[:, :, :turns] & self.config.joint
         return shown, Shown(recent, chosen, valid)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -102,6 +103,25 @@ def test_a_token_is_known_to_those_who_decide_later_and_to_nobody_before(agent: 
     assert changed[:, 7].all(), "everybody knows at the next decision"
 
 
+def test_agents_that_decide_apart_know_each_others_tokens_from_the_next_decision_on() -> None:
+    model, context = policy(config=replace(TINY, joint=False)), make_context(cars_at(0.0, 30.0, 10.0), featurize)
+    tokens = some_tokens(3)
+    other = tokens.clone()
+    other[:, 0, 6] = 13 * 12
+    changed = (logits_of(model, context, tokens) != logits_of(model, context, other)).any(-1)[0]
+    assert not changed[:, :7].any() and changed[:, 7].all()
+
+
+def test_agents_that_decide_apart_do_so_in_rollouts_too() -> None:
+    model, scene = policy(config=replace(TINY, joint=False)), cars_at(0.0, 30.0, 10.0, -20.0)
+    env = TransformedEnv(TrafficEnv([scene], num_rollouts=2), TokenAction(model.tokenizer))
+    rolled = env.rollout(16, MotionActor(model, Contexts([scene], model.featurize), num_rollouts=2))
+    tokens = rolled[keys.TOKEN].transpose(1, 2)
+    logits = logits_of(model, make_context(scene, featurize), tokens, torch.ones(1, 4, 16, dtype=torch.bool))
+    forced = logits.log_softmax(-1).gather(-1, tokens[..., None])[..., 0]
+    torch.testing.assert_close(rolled[keys.LOG_PROB].transpose(1, 2), forced, atol=1e-5, rtol=0)
+
+
 def test_a_token_that_is_not_valid_is_known_to_nobody() -> None:
     model, context = policy(), make_context(cars_at(0.0, 10.0, 20.0), featurize)
     tokens, valid = some_tokens(3), torch.ones(1, 3, 16, dtype=torch.bool)
@@ -197,7 +217,7 @@ def parameters(model: Trajeglish) -> int:
 
 
 def test_sizes_have_the_parameters_that_are_told() -> None:
-    assert set(SIZES) == {"nano", "35m"}
+    assert set(SIZES) == {"nano", "nano_apart", "35m"}
     assert parameters(Trajeglish("nano", VerletTokenizer())) == pytest.approx(0.15e6, rel=0.1)
     assert parameters(Trajeglish("35m", KDisksTokenizer(1, 384, "none"))) == pytest.approx(35e6, rel=0.1)
 
@@ -211,7 +231,7 @@ def test_the_size_of_the_paper_decides_ten_times_a_second() -> None:
 
 
 def test_an_unknown_size_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"one of \['35m', 'nano'\], got 'huge'"):
+    with pytest.raises(ValueError, match=r"one of \['35m', 'nano', 'nano_apart'\], got 'huge'"):
         Trajeglish("huge", VerletTokenizer())
 
 
