@@ -20,10 +20,11 @@ import hydra
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 
 from dpa.losses import NextTokenLoss, token_network
 from dpa.models import MotionModel
+from dpa.models.base import Auxiliary
 from dpa.training.batches import Item, collate_items, micro_batches
 from dpa.training.checkpoint import load_policy, load_weights
 from dpa.training.distributed import ALONE, Ranks, join_ranks
@@ -103,14 +104,20 @@ def pretrain(
     best = copy.deepcopy(model)
     train = training_items(cfg, splits.train, model, seed, ranks)
     tune = tuning_items(cfg, splits.tune, model, ranks)
-    loss = NextTokenLoss(token_network(model, options.precision), label_smoothing=options.label_smoothing)
+    trained = nn.ModuleDict({"policy": model, **auxiliary_of(model, options.auxiliary)}).to(device)
+    loss = NextTokenLoss(
+        token_network(model, options.precision),
+        label_smoothing=options.label_smoothing,
+        auxiliary=dict(trained).get("auxiliary"),
+        auxiliary_weight=options.auxiliary,
+    )
     loss.set_keys(labels=keys.LABELS)
     loss = ranks.wrap(loss)
-    optimizer = make_optimizer(model, options.lr, options.weight_decay, kind=options.optimizer, rms=options.rms)
+    optimizer = make_optimizer(trained, options.lr, options.weight_decay, kind=options.optimizer, rms=options.rms)
     schedule = make_schedule(optimizer, options.steps, options.warmup, options.schedule)
     run = Run(
         folder,
-        {"policy": model, "best": best, "optimizer": optimizer, "schedule": schedule},
+        {**trained, "best": best, "optimizer": optimizer, "schedule": schedule},
         config=decided_by,
         total_steps=options.steps,
         checkpoint_interval=options.checkpoint_interval,
@@ -150,6 +157,24 @@ def pretrain(
         write_json(result, {"options": decided_by} | told)
     ranks.wait()
     return path
+
+
+def auxiliary_of(model: MotionModel, weight: float) -> dict[str, Auxiliary]:
+    """The auxiliary loss of the policy's family by its name, where it has a weight.
+
+    Raises:
+        ValueError: the weight is negative, or the family has none.
+    """
+    if weight < 0:
+        raise ValueError(f"pretraining.auxiliary must be at least 0, got {weight}.")
+    if not weight:
+        return {}
+    auxiliary = model.auxiliary()
+    if auxiliary is None:
+        raise ValueError(
+            f"{type(model).__name__} has no auxiliary loss, and pretraining.auxiliary={weight} asks for one; say 0."
+        )
+    return {"auxiliary": auxiliary}
 
 
 def look(run: Run, model: MotionModel, best: MotionModel, tune: list[Item], device: str, ranks: Ranks = ALONE) -> None:

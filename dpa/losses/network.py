@@ -52,6 +52,11 @@ def token_network(model: nn.Module, precision: Precision = "float32") -> TensorD
     return network.train(model.training)
 
 
+def model_of(network: TensorDictModule) -> nn.Module:
+    """The model that :func:`token_network` wrapped."""
+    return network.module.model if isinstance(network.module, _Rounded) else network.module
+
+
 def distribution_of(network: TensorDictModule) -> Distribution:
     """What the logits of a network mean."""
     return getattr(network, "distribution", TOKENS)

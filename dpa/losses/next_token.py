@@ -11,7 +11,16 @@ from tensordict.nn import TensorDictModule, TensorDictParams, dispatch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from dpa.losses.network import CONTEXT, distribution_of, hold_network, logits_under, masked_mean, network_input
+from dpa.losses.network import (
+    CONTEXT,
+    distribution_of,
+    hold_network,
+    logits_under,
+    masked_mean,
+    model_of,
+    network_input,
+)
+from dpa.models.base import Auxiliary
 from envs import keys
 
 
@@ -26,9 +35,11 @@ class NextTokenLoss(LossModule):
 
     Keyword Args:
         label_smoothing: share of the target spread over all tokens.
+        auxiliary: of the policy's family (:meth:`~dpa.models.MotionModel.auxiliary`); its weights are the loss's.
+        auxiliary_weight: of it.
 
-    Returns ``loss_next_token`` and, detached, ``accuracy`` (share of tokens that are the most probable ones) and
-    ``entropy`` [nats].
+    Returns ``loss_next_token``, with an auxiliary loss ``loss_auxiliary``, which is that times its weight, and,
+    detached, ``accuracy`` (share of tokens that are the most probable ones) and ``entropy`` [nats].
 
     Examples:
         >>> from dpa.losses import token_network
@@ -79,12 +90,22 @@ class NextTokenLoss(LossModule):
     keeps_reference: ClassVar[bool] = False
     """Whether a frozen copy of the network, as it is when the loss is made, is kept."""
 
-    def __init__(self, actor_network: TensorDictModule, *, label_smoothing: float = 0.0) -> None:
+    def __init__(
+        self,
+        actor_network: TensorDictModule,
+        *,
+        label_smoothing: float = 0.0,
+        auxiliary: Auxiliary | None = None,
+        auxiliary_weight: float = 1.0,
+    ) -> None:
         super().__init__()
         if not 0 <= label_smoothing < 1:
             raise ValueError(f"label_smoothing must lie in [0, 1), got {label_smoothing}.")
         hold_network(self, actor_network, keep_reference=self.keeps_reference)
         self.label_smoothing = label_smoothing
+        self.auxiliary, self.auxiliary_weight = auxiliary, auxiliary_weight
+        if auxiliary is not None:
+            self.out_keys = [*self.out_keys, "loss_auxiliary"]
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -111,7 +132,14 @@ class NextTokenLoss(LossModule):
             entropy = masked_mean(says.entropy(logits), learnt)
             diagnostics = {"accuracy": masked_mean(hit, learnt), "entropy": entropy}
             diagnostics |= self._diagnostics(batch, logits)
-        return TensorDict({"loss_next_token": loss, **diagnostics}, batch_size=[])
+        losses = {"loss_next_token": loss}
+        if self.auxiliary is not None:
+            losses["loss_auxiliary"] = self.auxiliary_weight * self._auxiliary(batch)
+        return TensorDict(losses | diagnostics, batch_size=[])
+
+    def _auxiliary(self, batch: TensorDict) -> Tensor:
+        with self.actor_network_params.to_module(self.actor_network):
+            return self.auxiliary(model_of(self.actor_network), batch[CONTEXT])
 
     def _diagnostics(self, batch: TensorDict, logits: Tensor) -> dict[str, Tensor]:
         """What a subclass logs as well."""

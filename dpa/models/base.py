@@ -95,6 +95,19 @@ class Memory(Protocol):
         """
 
 
+class Auxiliary(nn.Module, ABC):
+    """A loss of a family beside the one of its tokens, with weights of its own that only pre-training needs."""
+
+    @abstractmethod
+    def forward(self, model: nn.Module, context: Context) -> Tensor:
+        """A scalar.
+
+        Args:
+            model: of the family.
+            context: of batch size ``[S]``.
+        """
+
+
 class MotionModel(nn.Module, ABC):
     """The distribution of what all agents of a scene do, decision after decision.
 
@@ -145,6 +158,10 @@ class MotionModel(nn.Module, ABC):
         Args:
             compile: run what decodes through :func:`torch.compile`.
         """
+
+    def auxiliary(self) -> Auxiliary | None:
+        """What pre-training may minimise as well (``pretraining.auxiliary``); none by default."""
+        return None
 
     @abstractmethod
     def bytes_per_row(self) -> int:

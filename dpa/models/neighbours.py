@@ -5,9 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+TIE = 1e-4
+"""Of things in order, by so much each counts as farther than the one before [m^2]."""
+
 
 @torch.no_grad()
-def nearest(pose: Tensor, others: Tensor, mask: Tensor, most: int) -> tuple[Tensor, Tensor]:
+def nearest(pose: Tensor, others: Tensor, mask: Tensor, most: int, *, ordered: bool = False) -> tuple[Tensor, Tensor]:
     """The nearest things of each node, in no order.
 
     Args:
@@ -15,6 +18,10 @@ def nearest(pose: Tensor, others: Tensor, mask: Tensor, most: int) -> tuple[Tens
         others: ``[B, n, 3]``.
         mask: broadcastable to ``[B, Q, n]`` bool, true where a node may look.
         most: K, or n where that is less.
+
+    Keyword Args:
+        ordered: of things equally far, which pieces of one length and lanes of one width are, the first come first;
+            otherwise rounding chooses.
 
     Returns:
         Squared distances ``[B, Q, K]`` [m^2], infinite where there is nothing, and indices into ``n``.
@@ -26,7 +33,10 @@ def nearest(pose: Tensor, others: Tensor, mask: Tensor, most: int) -> tuple[Tens
     """
     dx = pose[:, :, None, 0] - others[:, None, :, 0]
     dy = pose[:, :, None, 1] - others[:, None, :, 1]
-    square = torch.addcmul(dx.square(), dy, dy).masked_fill(~mask, torch.inf)
+    square = torch.addcmul(dx.square(), dy, dy)
+    if ordered:
+        square = square + TIE * torch.arange(others.shape[1], device=others.device)
+    square = square.masked_fill(~mask, torch.inf)
     near, index = square.topk(min(most, square.shape[-1]), largest=False, sorted=False)
     return near, index
 

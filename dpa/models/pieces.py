@@ -14,6 +14,8 @@ from envs.scene import CURRENT_STEP, LOG_STEPS, STEP_SECONDS, Agents, Lights, Li
 
 GRID = 4.0
 """Places nearer to each other than this count as one in the choice of pieces [m]."""
+ROUNDING = 1e-3
+"""Of a piece: by so much a line may be too long without a further piece, wherever a scene lies."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ def _places_ahead(agents: Agents, steps: int) -> Tensor:
     return torch.unique((places / GRID).round(), dim=0) * GRID  # the standing ones count once
 
 
-def cut_map(scene: Scene, steps: int, options: PieceOptions, num_points: int, slack: float = 0.0) -> Pieces:
+def cut_map(scene: Scene, steps: int, options: PieceOptions, num_points: int, *, evenly: bool = False) -> Pieces:
     """Cut the map of one uncollated scene into pieces and keep those nearest to where its agents may be.
 
     Args:
@@ -76,11 +78,13 @@ def cut_map(scene: Scene, steps: int, options: PieceOptions, num_points: int, sl
         steps: of 0.1 s, of the episode.
         options: length and number of pieces.
         num_points: that describe a piece, odd.
-        slack: a cut may lie so far before its place [m]: with some, rounding moves no cut from point to point.
+
+    Keyword Args:
+        evenly: pieces of a line are equally long, their points too, wherever points of the line lie; otherwise they
+            are runs of its points, which short pieces would often have but one of.
     """
     road, lights, places = scene.road, scene.lights, _places_ahead(scene.agents, steps)
-    owner, start, end = _cut(road, options.piece_length, slack)
-    points = _resample(road.points[:, :2], start, end, num_points)
+    owner, points = (_even if evenly else _runs)(road, options.piece_length, num_points)
     middle = points[:, num_points // 2]
     near = torch.cdist(middle, places).amin(1).argsort(stable=True)[: options.max_pieces]
     near = near.sort().values  # map order, so that equal scenes give equal tensors
@@ -95,30 +99,61 @@ def cut_map(scene: Scene, steps: int, options: PieceOptions, num_points: int, sl
     return Pieces(pose, local, road.kind[owner], state[owner], torch.ones(len(owner), dtype=torch.bool))
 
 
-def _cut(road: RoadMap, length: float, slack: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Cut polylines into runs of points: owner, first and last point of each run, all ``[pieces]``."""
+class _Cut(NamedTuple):
+    """Polylines cut into pieces, all ``[pieces]``.
+
+    Attributes:
+        owner: the polyline.
+        first: its first point.
+        last: its last point.
+        number: of a piece along it.
+        count: pieces of it.
+    """
+
+    owner: Tensor
+    first: Tensor
+    last: Tensor
+    number: Tensor
+    count: Tensor
+
+
+def _cut(road: RoadMap, length: float, rounding: float = 0.0) -> tuple[_Cut, Tensor]:
+    """Pieces of about a length, and how far along all lines together each point lies ``[points]``."""
     step = (road.points[1:, :2] - road.points[:-1, :2]).norm(dim=-1)
     arc = torch.cat((step.new_zeros(1), step.double().cumsum(0)))
     first = road.start.clamp(max=len(arc) - 1)  # features without points may come last
     last = first + (road.count - 1).clamp(min=0)
-    total = arc[last] - arc[first]
-    pieces = (total / length).ceil().clamp(min=1).long() * (road.count > 0)
+    pieces = ((arc[last] - arc[first]) / length - rounding).ceil().clamp(min=1).long() * (road.count > 0)
     owner = torch.repeat_interleave(torch.arange(len(pieces)), pieces)
     number = torch.arange(len(owner)) - torch.repeat_interleave(pieces.cumsum(0) - pieces, pieces)
-    share = total[owner] / pieces[owner].clamp(min=1)
-    cut = torch.searchsorted(arc, arc[first][owner] + share * number - slack).clamp(first[owner], last[owner])
-    following = torch.cat((cut[1:], cut[:1]))
-    ends_line = torch.cat((owner[1:] != owner[:-1], torch.ones(min(1, len(owner)), dtype=torch.bool)))
-    return owner, cut, torch.where(ends_line, last[owner], following)
+    return _Cut(owner, first[owner], last[owner], number, pieces[owner]), arc
 
 
-def _resample(points: Tensor, start: Tensor, end: Tensor, num: int) -> Tensor:
-    """``[pieces, num, 2]``: points at equal shares of the indices of each run."""
-    share = torch.linspace(0, 1, num)
-    at = start[:, None] + (end - start)[:, None] * share
+def _runs(road: RoadMap, length: float, num: int) -> tuple[Tensor, Tensor]:
+    """Runs of points: owner ``[pieces]``, and ``[pieces, num, 2]`` points at equal shares of the indices of each."""
+    cut, arc = _cut(road, length)
+    share = (arc[cut.last] - arc[cut.first]) / cut.count.clamp(min=1)
+    start = torch.searchsorted(arc, arc[cut.first] + share * cut.number).clamp(cut.first, cut.last)
+    following = torch.cat((start[1:], start[:1]))
+    end = torch.where(cut.number == cut.count - 1, cut.last, following)
+    at = start[:, None] + (end - start)[:, None] * torch.linspace(0, 1, num)
     low = at.floor().long()
     high = torch.minimum(low + 1, end[:, None])
-    return torch.lerp(points[low], points[high], (at - low)[..., None].to(points.dtype))
+    points = road.points[:, :2]
+    return cut.owner, torch.lerp(points[low], points[high], (at - low)[..., None].to(points.dtype))
+
+
+def _even(road: RoadMap, length: float, num: int) -> tuple[Tensor, Tensor]:
+    """Equal parts: owner ``[pieces]``, and ``[pieces, num, 2]`` points at equal distances along the line."""
+    cut, arc = _cut(road, length, ROUNDING)
+    first, last = cut.first[:, None], cut.last[:, None]
+    share = (cut.number[:, None] + torch.linspace(0, 1, num, dtype=arc.dtype)) / cut.count[:, None]
+    at = arc[first] + share * (arc[last] - arc[first])
+    low = (torch.searchsorted(arc, at, right=True) - 1).minimum(last - 1).maximum(first)
+    high = (low + 1).minimum(last)
+    within = ((at - arc[low]) / (arc[high] - arc[low]).clamp(min=1e-9)).clamp(0, 1)
+    points = road.points[:, :2]
+    return cut.owner, torch.lerp(points[low], points[high], within[..., None].to(points.dtype))
 
 
 def light_poses(road: RoadMap, lights: Lights) -> Tensor:

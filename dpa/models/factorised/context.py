@@ -14,8 +14,6 @@ from envs.scene import Scene
 
 PIECE_POINTS = 3
 """Points that describe a piece."""
-SLACK = 0.01
-"""Of a cut [m]: pieces are of the length of a few points, where rounding would move cuts from one to the next."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,7 @@ def featurize(scene: Scene, episode: Episode, options: NeighbourhoodOptions | No
         torch.Size([3, 2])
     """
     options = options or NeighbourhoodOptions()
-    pieces = cut_map(scene, episode.logged.shape[-2], options, PIECE_POINTS, SLACK)
+    pieces = cut_map(scene, episode.logged.shape[-2], options, PIECE_POINTS, evenly=True)
     return NeighbourhoodContext(
         episode=episode,
         **{f"map_{name}": value for name, value in pieces._asdict().items()},

@@ -128,12 +128,20 @@ class FactorisedModel(MotionModel):
         return partial(featurize, options=self.context)
 
     # --- map --------------------------------------------------------------------------------------------------------
-    def read_map(self, context: NeighbourhoodContext) -> Tensor:
-        """``[S * P, width]``: what the pieces are, and what lies around them."""
+    def read_map(self, context: NeighbourhoodContext, hidden: Tensor | None = None) -> Tensor:
+        """``[S * P, width]``: what the pieces are, and what lies around them.
+
+        Args:
+            context: of batch size ``[S]``.
+            hidden: ``[S, P]`` bool, pieces that no other one sees; none by default.
+        """
         points = context.map_points.flatten(-2) / METRES
         x = self.piece(points) + self.piece_kind(context.map_kind) + self.piece_light(context.map_light)
         pose, valid, config = context.map_pose, context.map_valid, self.config
-        edges = self._edges(self.map_edge, pose, pose, valid[:, None], config.map_pieces, config.map_radius)
+        valid = valid if hidden is None else valid & ~hidden
+        edges = self._edges(
+            self.map_edge, pose, pose, valid[:, None], config.map_pieces, config.map_radius, ordered=True
+        )
         x = x.flatten(0, 1)
         for layer in self.map_layers:
             x = layer(x, layer.remember(x), edges)
@@ -180,10 +188,18 @@ class FactorisedModel(MotionModel):
         return decisions.transpose(1, 2), (ends[..., 0] & ends[..., -1] & episode.valid[..., None]).transpose(1, 2)
 
     def _edges(
-        self, embed: FourierEmbedding, pose: Tensor, others: Tensor, mask: Tensor, most: int, radius: float
+        self,
+        embed: FourierEmbedding,
+        pose: Tensor,
+        others: Tensor,
+        mask: Tensor,
+        most: int,
+        radius: float,
+        *,
+        ordered: bool,
     ) -> Edges:
         """Edges from ``[B, Q]`` nodes to the nearest of ``[B, n]`` things in a mask, within a radius."""
-        square, index = nearest(pose, others, mask, most)
+        square, index = nearest(pose, others, mask, most, ordered=ordered)
         feature = embed(relative(pose[:, :, None], gather(others, index)))
         there = (rows_of(others, index), square <= radius**2, feature)
         return Edges(*(value.flatten(0, 1) for value in there))
@@ -192,13 +208,14 @@ class FactorisedModel(MotionModel):
         """From agents ``[R, A, 3]``, as many rows for each scene, to the pieces of their scene."""
         options = (self.config.agent_pieces, self.config.agent_map_radius)
         pose = pose.unflatten(0, (len(context.map_pose), -1)).flatten(1, 2)
-        return self._edges(self.agent_map_edge, pose, context.map_pose, context.map_valid[:, None], *options)
+        mask = context.map_valid[:, None]
+        return self._edges(self.agent_map_edge, pose, context.map_pose, mask, *options, ordered=True)
 
     def agent_edges(self, pose: Tensor, valid: Tensor) -> Edges:
         """Among the agents ``[R, A, 3]`` of one decision."""
         others = ~torch.eye(pose.shape[1], dtype=torch.bool, device=pose.device)
         options = (self.config.agents, self.config.agent_radius)
-        return self._edges(self.agent_edge, pose, pose, valid[:, None] & others, *options)
+        return self._edges(self.agent_edge, pose, pose, valid[:, None] & others, *options, ordered=False)
 
     def _past_edges(self, pose: Tensor, valid: Tensor, decisions: int) -> Edges:
         """From each node ``[B * T, A]`` to the same agent at the decisions before."""

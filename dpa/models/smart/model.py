@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from dpa.models.base import named_size
+from dpa.models.base import Auxiliary, named_size
 from dpa.models.factorised import METRES, FactorisedConfig, FactorisedModel, NeighbourhoodOptions, mlp
+from dpa.models.smart.road import NextPiece
 from dpa.tokens.base import MotionTokenizer, check_vocabulary
 from envs.geometry.frames import to_local
 from envs.scene import AgentKind
@@ -64,3 +65,7 @@ class SMART(FactorisedModel):
     def decide(self, x: Tensor, recent: Tensor) -> Tensor:
         """See :meth:`~dpa.models.factorised.FactorisedModel.decide`: logits of all tokens."""
         return self.head(x)
+
+    def auxiliary(self) -> Auxiliary:
+        """See :meth:`~dpa.models.base.MotionModel.auxiliary`: which way a lane goes on."""
+        return NextPiece(self.config.width)
