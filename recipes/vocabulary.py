@@ -1,6 +1,7 @@
-"""Make a vocabulary of logged motions (k-disks): the tokens of tokenizer=k_disks, for each class of agent.
+"""Make a vocabulary of logged motions, k-disks or a grid: the tokens of tokenizer=k_disks, for each class of agent.
 
 python -m recipes.vocabulary vocabulary.size=512 output=runs/vocabulary.npz
+python -m recipes.vocabulary vocabulary.maker=grid output=runs/grid.npz
 python -m recipes.pretrain tokenizer@model.tokenizer=k_disks model.tokenizer.table=runs/vocabulary.npz
 
 The file holds a card of what made it and of what it covers, which is printed as well.
@@ -20,9 +21,9 @@ from rich.table import Table
 from torch import Tensor
 
 from dpa.tokens.vocabulary import (
+    MAKERS,
     Vocabulary,
     corners,
-    k_disks,
     logged_motions,
     smallest_radius,
     stacked,
@@ -38,7 +39,7 @@ MOST = 100_000
 
 
 def make_vocabulary(options: DictConfig, train: SceneSource, tune: SceneSource) -> Vocabulary:
-    """K-disks of the motions of some scenes, with what they cover of others.
+    """A vocabulary of the motions of some scenes, with what it covers of others.
 
     Args:
         options: the section ``vocabulary``.
@@ -46,8 +47,10 @@ def make_vocabulary(options: DictConfig, train: SceneSource, tune: SceneSource) 
         tune: scenes whose motions are encoded.
 
     Raises:
-        ValueError: no whole decision is logged of any vehicle.
+        ValueError: no whole decision is logged of any vehicle, or an unknown maker.
     """
+    if options.maker not in MAKERS:
+        raise ValueError(f"vocabulary.maker must be one of {', '.join(MAKERS)}, got {options.maker!r}.")
     generator = torch.Generator().manual_seed(options.seed)
     seen, held_out = (
         logged_motions(_scenes(each, name), options.steps) for each, name in ((train, "train"), (tune, "tune"))
@@ -59,13 +62,14 @@ def make_vocabulary(options: DictConfig, train: SceneSource, tune: SceneSource) 
         if not len(motions):
             continue
         motions = motions[torch.randperm(len(motions), generator=generator)[:MOST]]
-        radius = options.radius or smallest_radius(motions, kind, options.size, options.seed)
-        entries[kind] = k_disks(motions, kind, options.size, radius, generator)
+        radius = options.radius or smallest_radius(options.maker, motions, kind, options.size, options.seed)
+        entries[kind] = MAKERS[options.maker](motions, kind, options.size, radius, generator)
         classes[kind.name.lower()] = {
             "motions": len(motions), "entries": len(entries[kind]), "radius": radius,
             **coverage(held_out[kind], entries[kind], kind, radius),
         }  # fmt: skip
-    return Vocabulary(stacked(entries), {"steps": options.steps, "size": options.size, "classes": classes})
+    made = {"maker": options.maker, "steps": options.steps, "size": options.size, "classes": classes}
+    return Vocabulary(stacked(entries), made)
 
 
 def coverage(motions: Tensor, entries: Tensor, kind: AgentKind, radius: float) -> dict[str, float | int | None]:

@@ -1,4 +1,4 @@
-"""Vocabularies of logged motions: k-disks by class of agent, and the file that keeps them (method.md section 2)."""
+"""Vocabularies of logged motions: k-disks or grids by class, and the file that keeps them (method.md section 2)."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dpa.tokens.grids import grid
 from envs.files import whole
 from envs.geometry.boxes import box_corners
 from envs.geometry.frames import to_local, wrap_angle
@@ -21,6 +22,8 @@ from envs.scene import AgentKind, Scene
 
 BOXES = {AgentKind.VEHICLE: (4.8, 2.0), AgentKind.PEDESTRIAN: (1.0, 1.0), AgentKind.CYCLIST: (2.0, 1.0)}
 """Length and width of the box by whose corners motions of a class are compared [m] (SMART, arXiv 2405.15677)."""
+FINEST = 0.005
+"""No vocabulary is finer than this radius [m]."""
 SUFFIX = ".npz"
 
 
@@ -104,12 +107,21 @@ def k_disks(motions: Tensor, kind: AgentKind, size: int, radius: float, generato
     return torch.stack([still[0], *chosen[1:]])
 
 
-def smallest_radius(motions: Tensor, kind: AgentKind, size: int, seed: int, digits: int = 3) -> float:
-    """The radius of k-disks of which ``size`` hold all motions [m], by bisection: the finest vocabulary of its size."""
-    low, high = 0.0, 4.0
+def cells(motions: Tensor, kind: AgentKind, size: int, radius: float, generator: torch.Generator) -> Tensor:
+    """A :func:`~dpa.tokens.grids.grid` by the arguments of :func:`k_disks`; ``radius`` is half the width of a cell."""
+    return grid(motions, size, 2 * radius)
+
+
+MAKERS = {"k_disks": k_disks, "grid": cells}
+"""Ways to make the entries of a class."""
+
+
+def smallest_radius(maker: str, motions: Tensor, kind: AgentKind, size: int, seed: int, digits: int = 3) -> float:
+    """The radius with which ``size`` entries hold all motions [m], by bisection: the finest vocabulary of its size."""
+    low, high = FINEST, 4.0
     while high - low > 10.0**-digits:
         radius = (low + high) / 2
-        needed = len(k_disks(motions, kind, size + 1, radius, torch.Generator().manual_seed(seed)))
+        needed = len(MAKERS[maker](motions, kind, size + 1, radius, torch.Generator().manual_seed(seed)))
         low, high = (radius, high) if needed > size else (low, radius)
     return round(high, digits)
 

@@ -31,6 +31,18 @@ def test_the_card_says_what_made_it_and_what_it_covers(words: Path) -> None:
     assert 0.5 < vehicles["covered"] <= 1
 
 
+def test_a_grid_is_a_vocabulary_too_and_another_maker_is_refused(
+    run: Callable, options: Callable, tmp_path: Path
+) -> None:
+    path = tmp_path / "grid.npz"
+    of = options("vocabulary", "vocabulary.size=24", f"output={path}")
+    assert run("vocabulary", *of, "vocabulary.maker=grid").status == 0
+    motions, card = read_vocabulary(path)
+    assert card["maker"] == "grid" and 2 < motions.shape[1] <= 24
+    outcome = run("vocabulary", *of, "vocabulary.maker=k_means")
+    assert outcome.status == 2 and "must be one of k_disks, grid, got 'k_means'" in outcome.err
+
+
 def trained(run: Callable, options: Callable, folder: Path, *more: str) -> Path:
     outcome = run("pretrain", *options("pretrain", *more, f"output={folder}"))
     assert outcome.status == 0, outcome.err

@@ -67,7 +67,7 @@ def test_every_motion_lies_near_an_entry_and_the_first_is_standing_still(radius:
 
 
 def test_the_smallest_radius_fills_the_vocabulary_and_a_smaller_one_does_not_hold_all() -> None:
-    radius = smallest_radius(MOTIONS, VEHICLE, 40, seed=0)
+    radius = smallest_radius("k_disks", MOTIONS, VEHICLE, 40, seed=0)
     assert len(k_disks(MOTIONS, VEHICLE, 99, radius, generator())) <= 40
     assert len(k_disks(MOTIONS, VEHICLE, 99, 0.9 * radius, generator())) > 40
 
