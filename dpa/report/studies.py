@@ -83,6 +83,37 @@ def plot_references(
     save_figure(figure, path)
 
 
+def plot_gains(
+    competence: Mapping[str, Interval], gains: Mapping[str, Mapping[str, Interval]], path: str | Path
+) -> None:
+    """Draw what methods gain against how good their references are, both with their 95 % intervals.
+
+    Args:
+        competence: realism of the reference, by comparison.
+        gains: by method and comparison.
+        path: PNG to write.
+    """
+    figure = blank_figure(7, 4.2)
+    axes = figure.subplots()
+    for place, (color, (method, found)) in enumerate(zip(_colours(len(gains)), gains.items(), strict=True)):
+        marker = MARKERS[place // len(CYCLE) % len(MARKERS)]
+        for number, (name, gain) in enumerate(found.items()):
+            at = competence[name]
+            axes.plot([at.low, at.high], [gain.mean] * 2, color=color, lw=1.2, alpha=0.35)
+            axes.plot([at.mean] * 2, [gain.low, gain.high], color=color, lw=1.6, alpha=0.6)
+            label = None if number else method
+            axes.plot(at.mean, gain.mean, marker, color=color, ms=7, mec="white", mew=1, label=label)
+    for name, at in competence.items():
+        top = max(found[name].high for found in gains.values())
+        axes.annotate(name, (at.mean, top), (0, 4), textcoords="offset points", ha="center", fontsize=7, color=INK)
+    axes.axhline(0, color=QUIET, lw=1)
+    axes.set_xlabel("realism of the reference", fontsize=8, color=INK)
+    axes.set_title("gain of realism over it")
+    axes.legend(frameon=False, fontsize=8, labelcolor=INK)
+    calm(axes, "both")
+    save_figure(figure, path)
+
+
 def plot_sensitivity(
     agreement: Mapping[str, Interval], margins: Sequence[tuple[str, Mapping[str, Interval]]], path: str | Path
 ) -> None:

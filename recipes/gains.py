@@ -1,0 +1,108 @@
+"""What alignment gains against how good its reference is: finished comparisons side by side.
+
+    python -m recipes.gains 'runs=[runs/driving,runs/smart]' 'methods=[dpa_omf,rloo_realism]'
+
+Of each comparison its reference, with the size of its policy where that is there, and the gain of some methods, best
+decoding against best, with the intervals of the comparison itself. Nothing is run.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
+
+from dpa.report.experiment import Comparison, Experiment, decoding_of, read_experiment
+from dpa.report.statistics import Interval, summary
+from dpa.report.studies import plot_gains
+from dpa.report.study import Evaluations
+from recipes.common.cli import CONFIG, recipe
+from recipes.common.models import open_policy
+from recipes.studies.tables import Cell, StudyTable, tell
+
+
+def read(runs: Path, name: str, methods: list[str]) -> Experiment:
+    """Read a comparison.
+
+    Raises:
+        ValueError: there is none of this name, or it lacks a method.
+    """
+    path = runs / "experiments" / f"{name}.json"
+    if not path.is_file():
+        raise ValueError(f"{runs} has no experiment {name!r}: finish it with recipes.compare, or name another one.")
+    experiment = read_experiment(path)
+    for method in methods:
+        if experiment.own_best.entry(method) is None:
+            compared = ", ".join(entry["method"] for entry in experiment.own_best.paired)
+            raise ValueError(f"{path} does not compare {method!r} with its reference; it has {compared}.")
+    return experiment
+
+
+def realism_of_reference(comparison: Comparison, folder: Path) -> Interval:
+    """Of all seeds and scenes, at the decoding that the others are compared with.
+
+    Raises:
+        ValueError: the values of its scenes are not there.
+    """
+    evaluations, values = Evaluations(folder), []
+    for row in comparison.base():
+        found = evaluations(row["file"])
+        if found is None:
+            raise ValueError(f"{folder / row['file']} is not there; the realism of the reference is in it.")
+        values.append(found["realism"])
+    there = [all(value is not None for value in scene) for scene in zip(*values, strict=True)]
+    return summary([[value for value, known in zip(row, there, strict=True) if known] for row in values])
+
+
+def gain_of(comparison: Comparison, method: str) -> Interval:
+    """Realism of a method minus that of its reference, as the comparison has it."""
+    entry = comparison.entry(method)
+    rows = comparison.of(method, decoding_of(entry))
+    scenes = rows[0]["n_scenes"]
+    return Interval(entry["realism_difference"], *entry["ci95"], entry["over"], entry["n_seeds"], scenes)
+
+
+def parameters_of(experiment: Experiment, folder: Path) -> float | None:
+    """Millions of parameters of the policies; None where their files are elsewhere."""
+    policy = folder / f"seed_{experiment.seeds[0]}" / "reference" / "policy.pt"
+    if not policy.is_file():
+        return None
+    return sum(value.numel() for value in open_policy(policy, "cpu")[0].parameters()) / 1e6
+
+
+@hydra.main(**CONFIG, config_name="gains")
+@recipe
+def main(cfg: DictConfig) -> None:
+    """Entry point of ``python -m recipes.gains``."""
+    methods, output = list(cfg.methods), Path(cfg.output)
+    found = [(Path(runs), read(Path(runs), cfg.name, methods)) for runs in cfg.runs]
+    labels = {method: found[0][1].labels[method] for method in methods}
+    rows: dict[str, list[Cell]] = {}
+    competence, gains = {}, {label: {} for label in labels.values()}
+    for folder, experiment in found:
+        best, name = experiment.own_best, folder.name
+        if name in rows:
+            raise ValueError(f"two of the runs are called {name!r}; rename a folder: they are told by their names.")
+        competence[name] = realism_of_reference(best, folder)
+        for method, label in labels.items():
+            gains[label][name] = gain_of(best, method)
+        told = [gains[label][name] for label in labels.values()]
+        rows[name] = [parameters_of(experiment, folder), float(len(experiment.seeds)), competence[name], *told]
+    output.mkdir(parents=True, exist_ok=True)
+    plot_gains(competence, gains, output / "gains.png")
+    columns = [
+        "runs",
+        "parameters [M]",
+        "seeds",
+        "realism of the reference",
+        *(f"gain of {each}" for each in labels.values()),
+    ]
+    title = f"{found[0][1].reported}, best decoding against best"
+    tell(cfg, [StudyTable("gains", title, columns, rows, signed=False)], {"gains": output / "gains.png"})
+    print(f"figure: {output / 'gains.png'}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

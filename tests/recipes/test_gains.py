@@ -1,0 +1,62 @@
+"""Gains against the competence of references, from finished comparisons."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.dpa.report.runs import SCENES, SEEDS, write_experiment
+
+METHODS = ["reference", "dpa_omf", "adversarial_afd"]
+
+
+@pytest.fixture(scope="module")
+def studies(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two finished comparisons."""
+    first = tmp_path_factory.mktemp("studies") / "first"
+    write_experiment(first, "methods", METHODS)
+    shutil.copytree(first, first.parent / "second")
+    return [first, first.parent / "second"]
+
+
+def told(studies: list[Path], output: Path, *more: str) -> list[str]:
+    runs = ",".join(map(str, studies))
+    return [f"runs=[{runs}]", "name=methods", "methods=[dpa_omf,adversarial_afd]", f"output={output}", *more]
+
+
+def test_the_table_has_the_differences_of_the_comparisons_and_the_realism_of_their_references(
+    run: Callable, studies: list[Path], tmp_path: Path
+) -> None:
+    outcome = run("gains", *told(studies, tmp_path))
+    assert outcome.status == 0, outcome.err
+    assert (tmp_path / "gains.png").is_file() and "first" in outcome.out and "second" in outcome.out
+    (table,) = (tmp_path / "tables").rglob("*.csv")
+    rows = {row["runs"]: row for row in csv.DictReader(table.read_text(encoding="utf-8").splitlines())}
+    content = json.loads((studies[0] / "experiments/methods.json").read_text())
+    (entry,) = [each for each in content["own_best"]["paired"] if each["method"] == "dpa_omf"]
+    assert float(rows["first"]["gain of DPA-OMF"]) == pytest.approx(entry["realism_difference"])
+    assert float(rows["first"]["gain of DPA-OMF low"]) == pytest.approx(entry["ci95"][0])
+    own = [row for row in content["own_best"]["rows"] if row["method"] == "reference"]
+    values = [json.loads((studies[0] / row["file"]).read_text())["per_scene"]["realism"] for row in own]
+    mean = sum(map(sum, values)) / (len(SEEDS) * SCENES)
+    assert float(rows["second"]["realism of the reference"]) == pytest.approx(mean)
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("name=competent", "has no experiment 'competent'"),
+        ("methods=[rloo]", "does not compare 'rloo' with its reference; it has dpa_omf, adversarial_afd"),
+        ("runs=[{0},{0}]", "two of the runs are called 'first'"),
+    ],
+)
+def test_what_is_not_there_is_told(
+    run: Callable, studies: list[Path], tmp_path: Path, option: str, message: str
+) -> None:
+    outcome = run("gains", *told(studies, tmp_path / "out", option.format(studies[0])))
+    assert outcome.status == 2 and message in outcome.err and outcome.err.count("error:") == 1, outcome.err
