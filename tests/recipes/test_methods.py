@@ -34,6 +34,16 @@ def configuration(*options: str) -> DictConfig:
         return compose("compare", list(options))
 
 
+def test_families_takes_over_the_trainings_of_competent() -> None:
+    """A name means one training in all experiments of a folder."""
+    some, all_of_them = configuration("experiment=families"), configuration("experiment=competent")
+    assert set(some.methods) < set(all_of_them.methods)
+    for name, method in some.methods.items():
+        assert method == all_of_them.methods[name]
+        assert some.experiment.setup.get(name) == all_of_them.experiment.setup.get(name)
+        assert some.experiment.labels[name] == all_of_them.experiment.labels.get(name, some.experiment.labels[name])
+
+
 @pytest.mark.parametrize(
     ("name", "method", "policy", "preferences", "expert", "changed"),
     [
