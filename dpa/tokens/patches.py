@@ -9,6 +9,8 @@ from dpa.tokens.base import MotionTokenizer
 from envs.geometry.frames import beside, rotate, wrap_angle
 from envs.scene import STEP_SECONDS
 
+STILL = (0.02, 0.02)
+"""An agent stands whose patch stays within this for each second of it [m, rad]."""
 ALIKE = 0.1
 """Patches that differ by less are one motion [m, rad]."""
 AHEAD, TURNED = 0.3, 0.05
@@ -20,8 +22,9 @@ FULL_TURN = 3.0
 class PatchTokenizer(MotionTokenizer):
     """A token is the patch of F poses, three numbers each, in the agent's own frame at its start.
 
-    Nothing is lost, so the log through tokens is the log. There is no vocabulary, hence no probability of a token but
-    a density. Noisy tokenization draws motions that end a little elsewhere.
+    Nothing is lost but what is too little to be a motion (:data:`STILL`), so the log through tokens is the log to two
+    centimetres. There is no vocabulary, hence no probability of a token but a density. Noisy tokenization draws motions
+    that end a little elsewhere.
 
     Args:
         steps: F.
@@ -46,8 +49,11 @@ class PatchTokenizer(MotionTokenizer):
         self.steps, self.shape = steps, (3 * steps,)
 
     def encode(self, target: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
-        """The poses as they are, headings from -pi to pi."""
-        return torch.cat((target[..., :2], wrap_angle(target[..., 2:])), -1).flatten(-2)
+        """The poses as they are, headings from -pi to pi; zeros where the agent stands."""
+        place, heading, seconds = target[..., :2], wrap_angle(target[..., 2:]), self.steps * STEP_SECONDS
+        moves = (place.norm(dim=-1) > STILL[0] * seconds) | (heading[..., 0].abs() > STILL[1] * seconds)
+        patch = torch.cat((place, heading), -1).flatten(-2)
+        return torch.where(moves.any(-1, keepdim=True), patch, 0.0)
 
     def decode(self, token: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
         """The poses themselves."""

@@ -1,4 +1,4 @@
-"""A density of patches: a mixture of modes, each of Laplace and von Mises densities, frame by frame.
+"""A density of patches: standing still, or a mixture of modes, each of Laplace and von Mises densities by frame.
 
 From frame to frame an agent moves by a step, seen along the heading halfway: forwards f, to the left l, while it turns
 by r. A mode says how much f changes and what l and r are, and how surely. So an agent keeps its speed unless a mode
@@ -8,8 +8,10 @@ A patch has the frames t = 1 to F; f_0 is the step forwards that was seen last. 
 
     ``p = sum_k pi_k prod_t Laplace(f_t - f_{t-1}; m, b) Laplace(l_t; m, b) VonMises(r_t; m, kappa)``
 
-with m, b and kappa of mode k and frame t. Poses and ``(f, l, r)`` map onto each other by turning and adding up, with
-determinant 1, so it is the density of the poses as well [1/m and 1/rad for each frame's numbers].
+with m, b and kappa of mode k and frame t. The patch of an agent that stands has a probability of its own instead,
+``1 - sum_k pi_k``: what is drawn from densities, however narrow, creeps. Poses and ``(f, l, r)`` map onto each other by
+turning and adding up, with determinant 1, so it is the density of the poses as well [1/m and 1/rad for each frame's
+numbers].
 """
 
 from __future__ import annotations
@@ -45,7 +47,7 @@ class Mixture(NamedTuple):
     """What a row of numbers says.
 
     Attributes:
-        modes: ``[*, K]`` log-probabilities.
+        modes: ``[*, K + 1]`` log-probabilities, that of standing still last.
         mean: ``[*, K, F, 3]`` of the change of f, of l and of r [m, rad].
         scale: ``[*, K, F, 2]`` of the Laplace densities [m].
         kappa: ``[*, K, F]`` of the von Mises density.
@@ -60,9 +62,9 @@ class Mixture(NamedTuple):
 
     @classmethod
     def of(cls, logits: Tensor, frames: int) -> Mixture:
-        """Read ``[*, K + 6 * K * F + 1]`` numbers."""
-        modes = (logits.shape[-1] - 1) // (1 + 6 * frames)
-        weight, rest, before = logits.split((modes, modes * 6 * frames, 1), -1)
+        """Read ``[*, K + 1 + 6 * K * F + 1]`` numbers."""
+        modes = (logits.shape[-1] - 2) // (1 + 6 * frames)
+        weight, rest, before = logits.split((modes + 1, modes * 6 * frames, 1), -1)
         mean, spread, sure = rest.unflatten(-1, (modes, frames, 6)).split((3, 2, 1), -1)
         least, most = CONCENTRATION
         kappa = (sure[..., 0].clamp(max=math.log(most))).exp() + least
@@ -75,7 +77,7 @@ class Mixture(NamedTuple):
 
 
 class PatchMixture(Distribution):
-    """Of patches of F poses, by K modes: P is ``K + 6 K F + 1``.
+    """Of patches of F poses, by K modes and standing still: P is ``K + 6 K F + 2``.
 
     Entropy and divergence of a mixture have no closed form. Those here are of the mode and of the frames given the
     mode: bounds from above, exact where modes do not overlap, and 0 where nothing differs.
@@ -87,7 +89,7 @@ class PatchMixture(Distribution):
 
     Examples:
         >>> mixture = PatchMixture(frames=10)
-        >>> logits = torch.zeros(2, 4 * 61 + 1)  # four modes
+        >>> logits = torch.zeros(2, 4 * 61 + 2)  # four modes
         >>> patch, by = mixture.draw(logits, torch.rand(2, mixture.numbers), Decoding(top_p=1.0))
         >>> patch.shape, torch.allclose(by, mixture.log_prob(logits, patch), rtol=1e-3)
         (torch.Size([2, 30]), True)
@@ -99,7 +101,10 @@ class PatchMixture(Distribution):
         self.frames, self.numbers = frames, 1 + 3 * frames
 
     def log_prob(self, logits: Tensor, token: Tensor) -> Tensor:
-        """See :meth:`~dpa.models.distribution.Distribution.log_prob`; per metre and radian of each frame."""
+        """See :meth:`~dpa.models.distribution.Distribution.log_prob`.
+
+        Per metre and radian of each frame, and a probability where the agent stands.
+        """
         return self._log_density(Mixture.of(logits, self.frames), token)
 
     def entropy(self, logits: Tensor) -> Tensor:
@@ -107,7 +112,7 @@ class PatchMixture(Distribution):
         said = Mixture.of(logits, self.frames)
         laplace = (1 + math.log(2) + said.scale.log()).sum((-1, -2))
         mises = (_log_bessel(said.kappa) + math.log(2 * math.pi) + _slack(said.kappa)).sum(-1)
-        return (said.modes.exp() * (laplace + mises - said.modes)).sum(-1)
+        return (said.modes.exp() * (_and_still(laplace + mises) - said.modes)).sum(-1)
 
     def divergence(self, logits: Tensor, reference: Tensor) -> Tensor:
         """See :meth:`~dpa.models.distribution.Distribution.divergence`; a bound from above, mode by mode."""
@@ -119,12 +124,13 @@ class PatchMixture(Distribution):
         mises = _log_bessel(other.kappa) - _log_bessel(one.kappa)
         mises = mises + (other.kappa - one.kappa) * lost + (1 - lost) * other.kappa * turned
         frames = laplace.sum((-1, -2)) + mises.sum(-1)
-        return (one.modes.exp() * (one.modes - other.modes + frames)).sum(-1)
+        return (one.modes.exp() * (one.modes - other.modes + _and_still(frames))).sum(-1)
 
     def likeliest(self, logits: Tensor) -> Tensor:
         """The middle of the most probable mode."""
         said = Mixture.of(logits, self.frames)
-        return _poses(_of_mode(said.mean, said.modes.argmax(-1)), said.before)
+        mode = said.modes.argmax(-1)
+        return _unless_still(_poses(_of_mode(said.mean, mode), said.before), said, mode)
 
     def hit(self, logits: Tensor, token: Tensor) -> Tensor:
         """Whether the middle of the most probable mode ends within :data:`NEAR` of the patch."""
@@ -139,6 +145,7 @@ class PatchMixture(Distribution):
         moved = _laplace(uniform[..., :2]) * scale
         turned = _mises(uniform[..., 2], kappa)
         patch = _poses(mean + torch.cat((moved, turned[..., None]), -1), said.before)
+        patch = _unless_still(patch, said, mode)
         return patch, self._log_density(said, patch)
 
     def _log_density(self, said: Mixture, patch: Tensor) -> Tensor:
@@ -146,11 +153,23 @@ class PatchMixture(Distribution):
         off = change - said.mean
         laplace = -(off[..., :2].abs() / said.scale) - (2 * said.scale).log()
         mises = -2 * said.kappa * (off[..., 2] / 2).sin().square() - _log_bessel(said.kappa) - math.log(2 * math.pi)
-        return (said.modes + laplace.sum((-1, -2)) + mises.sum(-1)).logsumexp(-1)
+        moves = (said.modes[..., :-1] + laplace.sum((-1, -2)) + mises.sum(-1)).logsumexp(-1)
+        return torch.where((patch == 0).all(-1), said.modes[..., -1], moves)
+
+
+def _and_still(value: Tensor) -> Tensor:
+    """``[*, K]`` of modes, and 0 of standing still."""
+    return torch.cat((value, torch.zeros_like(value[..., :1])), -1)
+
+
+def _unless_still(patch: Tensor, said: Mixture, mode: Tensor) -> Tensor:
+    """The patch of a mode, or that of an agent that stands."""
+    return torch.where((mode == said.modes.shape[-1] - 1)[..., None], 0.0, patch)
 
 
 def _of_mode(value: Tensor, mode: Tensor) -> Tensor:
-    """``[*, K, ...]`` at ``[*]``."""
+    """``[*, K, ...]`` at ``[*]``; at K, where the agent stands, those of the last mode."""
+    mode = mode.clamp(max=value.shape[mode.dim()] - 1)
     index = mode.view(*mode.shape, *(1,) * (value.dim() - mode.dim()))
     return value.gather(mode.dim(), index.expand(*mode.shape, 1, *value.shape[mode.dim() + 1 :])).squeeze(mode.dim())
 

@@ -23,7 +23,7 @@ class BehaviorGPTConfig(FactorisedConfig):
     """Size of the model.
 
     Attributes:
-        modes: K of the mixture.
+        modes: K of the mixture, beside standing still.
         frame_width: channels of a frame, and of what unrolls the frames of a mode.
     """
 
@@ -79,7 +79,7 @@ class BehaviorGPT(FactorisedModel):
         self.kind = nn.Embedding(len(AgentKind), width)
         self.frame, self.key, self.value = mlp(7, inner), nn.Linear(inner, inner), nn.Linear(inner, width)
         self.own = mlp(3, width)
-        self.weight = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, config.modes))
+        self.weight = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, config.modes + 1))
         self.start, self.mode = nn.Linear(width, inner), nn.Embedding(config.modes, inner)
         self.when, self.recur = nn.Embedding(tokenizer.steps, 3 * inner), nn.Linear(inner, 3 * inner)
         self.out = nn.Linear(inner, 6)

@@ -8,7 +8,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from dpa.tokens import PatchTokenizer, TokenAction
-from dpa.tokens.patches import AHEAD, TURNED
+from dpa.tokens.patches import AHEAD, STILL, TURNED
 from envs import keys
 from envs.episode import EpisodeOptions, make_episode
 from envs.geometry.frames import to_local, to_world, wrap_angle
@@ -28,6 +28,17 @@ def test_the_log_through_patches_is_the_log(steps: int) -> None:
         off = poses - episode.logged
         off = torch.cat((off[..., :2], wrap_angle(off[..., 2:])), -1)
         assert off[episode.logged_valid].abs().max() < 1e-3
+
+
+@pytest.mark.parametrize("steps", [2, 10])
+def test_what_is_too_little_to_be_a_motion_is_standing_still(steps: int) -> None:
+    tokenizer, seconds = PatchTokenizer(steps), 0.1 * steps
+    little, turn = torch.zeros(4, steps, 3), STILL[1] * seconds
+    little[0, -1, 0], little[1, -1, 0] = 0.9 * STILL[0] * seconds, 1.1 * STILL[0] * seconds
+    little[2, -1, 2], little[3, -1, 2] = 0.9 * turn, 1.1 * turn
+    patches = tokenizer.encode(little, torch.zeros(4, steps + 1, 3), torch.ones(4, dtype=torch.int64))
+    assert patches.any(-1).tolist() == [False, True, False, True]
+    torch.testing.assert_close(patches[1::2], little[1::2].flatten(-2))  # any other motion is itself
 
 
 def test_an_environment_takes_patches() -> None:

@@ -29,11 +29,12 @@ from dpa.tokens import PatchTokenizer, VerletTokenizer
 WHOLE = Decoding(top_p=1.0)
 
 
-def numbers(modes: int, frames: int, seed: int = 0, spread: float = 1.0) -> Tensor:
+def numbers(modes: int, frames: int, seed: int = 0, still: float = 0.5) -> Tensor:
+    """A row of modes, and standing still with this logit."""
     generator = torch.Generator().manual_seed(seed)
-    logits = spread * torch.randn(modes * (1 + 6 * frames) + 1, generator=generator, dtype=torch.float64)
+    logits = torch.randn(modes * (1 + 6 * frames) + 1, generator=generator, dtype=torch.float64)
     logits[-1:] *= 0.1
-    return logits
+    return torch.cat((logits[:modes], torch.tensor([still], dtype=torch.float64), logits[modes:]))
 
 
 def many(mixture: PatchMixture, logits: Tensor, count: int, decoding: Decoding = WHOLE) -> tuple[Tensor, Tensor]:
@@ -42,28 +43,33 @@ def many(mixture: PatchMixture, logits: Tensor, count: int, decoding: Decoding =
 
 
 def test_one_mode_and_frame_is_what_scipy_says() -> None:
-    logits = torch.tensor([0.3, 0.1 / UNIT, -0.2 / UNIT, 0.05 / UNIT, -1.0, -2.0, 3.0, 0.4], dtype=torch.float64)
+    logits = torch.tensor(
+        [0.3, 0.3 - math.log(3), 0.1 / UNIT, -0.2 / UNIT, 0.05 / UNIT, -1.0, -2.0, 3.0, 0.4], dtype=torch.float64
+    )
     patch = torch.tensor([0.6, -0.1, 0.2], dtype=torch.float64)
     said = Mixture.of(logits, 1)
     along, across = said.scale[0, 0].tolist()
     assert (along, across) == pytest.approx((math.log1p(math.exp(-1.0)) + 0.001, math.log1p(math.exp(-2.0)) + 0.001))
     forwards, left = (0.6 * math.cos(0.1) - 0.1 * math.sin(0.1), -0.1 * math.cos(0.1) - 0.6 * math.sin(0.1))
     expected = (
-        stats.laplace.logpdf(forwards - 0.4, 0.1, along)  # the agent moved by 0.4 m in the step before
+        math.log(0.75)  # a quarter stands
+        + stats.laplace.logpdf(forwards - 0.4, 0.1, along)  # the agent moved by 0.4 m in the step before
         + stats.laplace.logpdf(left, -0.2, across)
         + stats.vonmises.logpdf(0.2, math.exp(3.0) + CONCENTRATION[0], loc=0.05)
     )
     assert PatchMixture(1).log_prob(logits, patch).item() == pytest.approx(expected, abs=1e-9)
+    assert PatchMixture(1).log_prob(logits, 0 * patch).exp().item() == pytest.approx(0.25)
 
 
-def test_it_integrates_to_one() -> None:
+def test_it_integrates_to_one_together_with_standing_still() -> None:
     mixture, logits = PatchMixture(1), numbers(3, 1, seed=2)
-    logits[3:-1].view(3, 1, 6)[..., 3:5] = 1.0  # wider than the grid
+    logits[4:-1].view(3, 1, 6)[..., 3:5] = 1.0  # wider than the grid
     grid = torch.linspace(-12, 12, 241, dtype=torch.float64)
     angle = torch.linspace(-math.pi, math.pi, 101, dtype=torch.float64)[:-1]
     patches = torch.cartesian_prod(grid, grid, angle)
-    density = mixture.log_prob(logits, patches).exp()
-    assert (density.sum() * 0.1 * 0.1 * 2 * math.pi / 100).item() == pytest.approx(1.0, abs=2e-3)
+    density = mixture.log_prob(logits, patches + 1e-9).exp()
+    still = mixture.log_prob(logits, torch.zeros(3, dtype=torch.float64)).exp()
+    assert (density.sum() * 0.1 * 0.1 * 2 * math.pi / 100 + still).item() == pytest.approx(1.0, abs=2e-3)
 
 
 def test_what_is_drawn_has_the_density_that_is_told_and_entropy_bounds_it() -> None:
@@ -72,6 +78,7 @@ def test_what_is_drawn_has_the_density_that_is_told_and_entropy_bounds_it() -> N
     torch.testing.assert_close(by, mixture.log_prob(logits, patch))
     drawn = -by.mean().item()
     assert drawn - 0.05 < mixture.entropy(logits).item() < drawn + math.log(4)
+    assert ((patch == 0).all(-1).double().mean() - mixture.log_prob(logits, 0 * patch[0]).exp()).abs() < 0.01
     single = numbers(1, 3)
     assert mixture.entropy(single).item() == pytest.approx(-many(mixture, single, 60_000)[1].mean().item(), abs=0.03)
 
@@ -98,7 +105,7 @@ def test_divergence_is_zero_of_itself_and_above_what_samples_say() -> None:
     assert mixture.divergence(one, one).item() == pytest.approx(0.0, abs=1e-12)
     assert 0 < sampled - 0.02 < mixture.divergence(one, other).item() < 2 * sampled
     single, moved = numbers(1, 3), numbers(1, 3)
-    moved[1:-1] += 0.2
+    moved[1:-1] += 0.2  # standing still as well
     patch, by = many(mixture, single, 60_000)
     exact = (by - mixture.log_prob(moved, patch)).mean().item()
     assert mixture.divergence(single, moved).item() == pytest.approx(exact, rel=0.03)
@@ -116,24 +123,32 @@ def test_poses_and_their_changes_map_onto_each_other(frames: int, seed: int, spr
 
 def test_gradients_are_finite_where_agents_stand_and_where_densities_are_narrow() -> None:
     mixture = PatchMixture(10)
-    logits = torch.zeros(5, 16 * 61 + 1)
-    logits[:, 16:-1] = torch.tensor([-50.0, -5.0, 0.0, 5.0, 50.0])[:, None]
+    logits = torch.zeros(5, 16 * 61 + 2)
+    logits[:, 17:-1] = torch.tensor([-50.0, -5.0, 0.0, 5.0, 50.0])[:, None]
     logits.requires_grad_()
-    total = mixture.log_prob(logits, torch.zeros(5, 30)) + mixture.entropy(logits)
-    (total + mixture.divergence(logits, torch.zeros(5, 16 * 61 + 1))).sum().backward()
+    total = mixture.log_prob(logits, torch.full((5, 30), 1e-4)) + mixture.log_prob(logits, torch.zeros(5, 30))
+    total = total + mixture.entropy(logits)
+    (total + mixture.divergence(logits, torch.zeros(5, 16 * 61 + 2))).sum().backward()
     assert total.isfinite().all() and logits.grad.isfinite().all()
 
 
 def test_a_nucleus_cuts_modes_and_a_temperature_narrows_them() -> None:
-    mixture, logits = PatchMixture(2), torch.zeros(2 * 13 + 1, dtype=torch.float64)
-    logits[0] = 4.0  # 98 % of the first mode, which goes 10 m further each step
-    logits[2:26].view(2, 2, 6)[0, :, 0] = 10.0 / UNIT
+    mixture, logits = PatchMixture(2), torch.zeros(2 * 13 + 2, dtype=torch.float64)
+    logits[0], logits[2] = 4.0, -20.0  # 98 % of the first mode, which goes 10 m further each step
+    logits[3:27].view(2, 2, 6)[0, :, 0] = 10.0 / UNIT
     first, _ = many(mixture, logits, 500, Decoding(top_p=0.9))
     assert (first[:, 0] > 4).all() and not (many(mixture, logits, 2000)[0][:, 0] > 4).all()
     calm, _ = many(mixture, logits, 500, Decoding(top_p=0.9, temperature=0.01))
     middle = mixture.likeliest(logits)
     assert (calm - middle).abs().max() < 1.0 < (first - middle).abs().max()
     assert mixture.hit(logits, middle) and not mixture.hit(logits, middle + 2.0)
+
+
+def test_an_agent_that_stands_does_not_move_at_all() -> None:
+    mixture, logits = PatchMixture(3), numbers(4, 3, still=20.0)
+    patch, by = many(mixture, logits, 500)
+    assert not patch.any() and not mixture.likeliest(logits).any()
+    assert by.exp().mean().item() == pytest.approx(1.0, abs=1e-6)
 
 
 def test_an_untrained_policy_goes_on_as_agents_do() -> None:
