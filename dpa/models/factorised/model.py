@@ -7,7 +7,7 @@ agents of the same decision, in this order, over edges that know the relative po
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -25,6 +25,9 @@ from dpa.tokens.base import MotionTokenizer
 from envs.episode import HISTORY
 from envs.geometry.frames import to_world
 from envs.scene import NUM_MAP_KINDS, STEP_SECONDS, LightState
+
+LOOK_AHEAD = 2.0
+"""An agent sees the map around it, and around where it will be so much later at its speed [s]: lights and bends."""
 
 
 @dataclass(frozen=True)
@@ -139,9 +142,8 @@ class FactorisedModel(MotionModel):
         x = self.piece(points) + self.piece_kind(context.map_kind) + self.piece_light(context.map_light)
         pose, valid, config = context.map_pose, context.map_valid, self.config
         valid = valid if hidden is None else valid & ~hidden
-        edges = self._edges(
-            self.map_edge, pose, pose, valid[:, None], config.map_pieces, config.map_radius, ordered=True
-        )
+        near = nearest(pose, pose, valid[:, None], config.map_pieces, ordered=True)
+        edges = self._edges(self.map_edge, pose, pose, [near], config.map_radius)
         x = x.flatten(0, 1)
         for layer in self.map_layers:
             x = layer(x, layer.remember(x), edges)
@@ -163,7 +165,7 @@ class FactorisedModel(MotionModel):
         kind = context.episode.kind.repeat_interleave(rollouts * decisions, 0)
         x = self.embed(recent, token, kind, context.episode.extent.repeat_interleave(rollouts * decisions, 0))
         pose, pieces, x = recent[:, :, -1], self.read_map(context), x.flatten(0, 1)
-        map_edges = self.map_edges(context, pose)
+        map_edges = self.map_edges(context, recent)
         agent_edges, past = self.agent_edges(pose, valid), self._past_edges(pose, valid, decisions)
         for layer in self.layers:
             x = layer.past(x, layer.past.remember(x), past)
@@ -192,30 +194,33 @@ class FactorisedModel(MotionModel):
         embed: FourierEmbedding,
         pose: Tensor,
         others: Tensor,
-        mask: Tensor,
-        most: int,
+        found: Sequence[tuple[Tensor, Tensor]],
         radius: float,
-        *,
-        ordered: bool,
     ) -> Edges:
-        """Edges from ``[B, Q]`` nodes to the nearest of ``[B, n]`` things in a mask, within a radius."""
-        square, index = nearest(pose, others, mask, most, ordered=ordered)
+        """Edges from ``[B, Q]`` nodes to what :func:`nearest` found of ``[B, n]`` things, within a radius."""
+        square, index = (torch.cat(each, -1) for each in zip(*found, strict=True))
         feature = embed(relative(pose[:, :, None], gather(others, index)))
         there = (rows_of(others, index), square <= radius**2, feature)
         return Edges(*(value.flatten(0, 1) for value in there))
 
-    def map_edges(self, context: NeighbourhoodContext, pose: Tensor) -> Edges:
-        """From agents ``[R, A, 3]``, as many rows for each scene, to the pieces of their scene."""
-        options = (self.config.agent_pieces, self.config.agent_map_radius)
-        pose = pose.unflatten(0, (len(context.map_pose), -1)).flatten(1, 2)
-        mask = context.map_valid[:, None]
-        return self._edges(self.agent_map_edge, pose, context.map_pose, mask, *options, ordered=True)
+    def map_edges(self, context: NeighbourhoodContext, recent: Tensor) -> Edges:
+        """From agents that moved so, ``[R, A, F + 1, 3]``, as many rows for each scene, to the pieces of their scene.
+
+        Half of the pieces are those nearest to the agent, half those nearest to where it will be if it goes on.
+        """
+        most, places = self.config.agent_pieces, context.map_pose
+        recent = recent.unflatten(0, (len(places), -1)).flatten(1, 2)
+        pose, mask = recent[:, :, -1], context.map_valid[:, None].expand(-1, recent.shape[1], -1)
+        ahead = pose + (pose - recent[:, :, 0]) * (LOOK_AHEAD / (self.tokenizer.steps * STEP_SECONDS))
+        near = nearest(pose, places, mask, most - most // 2, ordered=True)
+        beyond = nearest(ahead, places, mask.scatter(-1, near[1], False), most // 2, ordered=True)
+        return self._edges(self.agent_map_edge, pose, places, [near, beyond], self.config.agent_map_radius)
 
     def agent_edges(self, pose: Tensor, valid: Tensor) -> Edges:
         """Among the agents ``[R, A, 3]`` of one decision."""
         others = ~torch.eye(pose.shape[1], dtype=torch.bool, device=pose.device)
-        options = (self.config.agents, self.config.agent_radius)
-        return self._edges(self.agent_edge, pose, pose, valid[:, None] & others, *options, ordered=False)
+        near = nearest(pose, pose, valid[:, None] & others, self.config.agents)
+        return self._edges(self.agent_edge, pose, pose, [near], self.config.agent_radius)
 
     def _past_edges(self, pose: Tensor, valid: Tensor, decisions: int) -> Edges:
         """From each node ``[B * T, A]`` to the same agent at the decisions before."""
@@ -319,7 +324,7 @@ class FactorisedMemory:
     def _advance(self, past: Past, seen: Observation, extent: Tensor) -> tuple[Tensor, Past]:
         """``[B, A, width]`` after all layers, and the past with this decision."""
         model, pose = self.model, seen.recent[:, :, -1]
-        map_edges, agent_edges = model.map_edges(self._context, pose), model.agent_edges(pose, seen.valid)
+        map_edges, agent_edges = model.map_edges(self._context, seen.recent), model.agent_edges(pose, seen.valid)
         edges, keys = self._edges(past, pose), []
         x = model.embed(seen.recent, seen.token, seen.kind, extent).flatten(0, 1)
         for layer, pieces, before in zip(model.layers, self._pieces, past.keys, strict=True):
