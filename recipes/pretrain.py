@@ -131,8 +131,7 @@ def pretrain(
         train.load_state_dict(run.state["train"])
     batches = train.endless()
     with run:
-        # Labels that lead back from noise are not the log's own: on clean logs the start would stay ahead.
-        if origin is not None and run.first_step == 0 and not options.noise:
+        if origin is not None and run.first_step == 0:
             look(run, model, best, tune, device, ranks)
         for step in run.steps():
             items = next(batches)
@@ -268,9 +267,21 @@ def training_items(
 
 
 def tuning_items(cfg: DictConfig, scenes: SceneSource, model: MotionModel, ranks: Ranks = ALONE) -> list[Item]:
-    """This rank's part of the tokenized logs of a few scenes, always the same."""
-    options = episode_options(cfg.model)
-    logs = LogItems(scenes, model.tokenizer.on_cpu(), model.featurize, options, max_agents=cfg.pretraining.max_agents)
+    """This rank's part of the tokenized logs of a few scenes, always the same.
+
+    Noise is as in training: labels that lead back slowly are not the tokens of clean logs, and by those a policy that
+    learns them would be judged by something else.
+    """
+    options, learnt = episode_options(cfg.model), cfg.pretraining
+    logs = LogItems(
+        scenes,
+        model.tokenizer.on_cpu(),
+        model.featurize,
+        options,
+        noise=learnt.noise,
+        recovery=learnt.recovery,
+        max_agents=learnt.max_agents,
+    )
     bar = progress(ranks.mine(range(len(scenes))), "tokens", unit="scene", disable=not ranks.main)
     items = logs.collate([logs.prepare(index, make_generator(0, "tune", index)) for index in bar])
     if not ranks.sum(torch.tensor(sum(int(item.token_valid.sum()) for item in items))):
@@ -286,7 +297,7 @@ def tuning_items(cfg: DictConfig, scenes: SceneSource, model: MotionModel, ranks
 def negative_log_likelihood(
     model: MotionModel, items: list[Item], device: str, ranks: Ranks = ALONE
 ) -> dict[str, float]:
-    """Per valid token [nats]: ``nll`` of all agents and ``nll_moving`` of those whose velocity changes at all.
+    """Of labels, per valid token [nats]: ``nll`` of all agents and ``nll_moving`` of those whose labels change at all.
 
     A standing agent repeats one token and is easy; it would hide how moving agents are predicted. Each rank gives the
     items that it measures; sums and counts are added up, so it is the mean over the items of all ranks.
@@ -295,11 +306,11 @@ def negative_log_likelihood(
     totals = torch.zeros(2, 2, dtype=torch.float64)
     for item in items:
         batch = collate_items([item]).to(device)
-        tokens, valid = batch["tokens"], batch["token_valid"]
-        logits = model(batch["context"], tokens, valid)
-        nll = -model.distribution.log_prob(logits, tokens).cpu()
-        valid, tokens = valid.cpu(), tokens.cpu()
-        changes = (~model.tokenizer.alike(tokens, tokens[:, :, :, :1]) & valid).any(-1, keepdim=True)
+        labels, valid = batch[keys.LABELS], batch["token_valid"]
+        logits = model(batch["context"], batch["tokens"], valid)
+        nll = -model.distribution.log_prob(logits, labels).cpu()
+        valid, labels = valid.cpu(), labels.cpu()
+        changes = (~model.tokenizer.alike(labels, labels[:, :, :, :1]) & valid).any(-1, keepdim=True)
         for row, mask in enumerate((valid, valid & changes)):
             totals[row] += torch.tensor([nll[mask].sum(), mask.sum()], dtype=torch.float64)
     model.train()

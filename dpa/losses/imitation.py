@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from dpa.losses.network import distribution_of, masked_mean, reference_logits
@@ -49,6 +50,9 @@ class ImitationLoss(NextTokenLoss):
 
     keeps_reference = True
     out_keys = ["loss_next_token", "accuracy", "entropy", "kl"]
+
+    def __init__(self, actor_network: TensorDictModule, *, label_smoothing: float = 0.0) -> None:
+        super().__init__(actor_network, label_smoothing=label_smoothing)
 
     def _diagnostics(self, batch: TensorDict, logits: Tensor) -> dict[str, Tensor]:
         drift = distribution_of(self.actor_network).divergence(logits, reference_logits(self, batch))
