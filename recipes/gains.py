@@ -15,11 +15,12 @@ import hydra
 from omegaconf import DictConfig
 
 from dpa.report.experiment import Comparison, Experiment, decoding_of, read_experiment
+from dpa.report.paired import scene_values
 from dpa.report.statistics import Interval, summary
 from dpa.report.studies import plot_gains
 from dpa.report.study import Evaluations
 from recipes.common.cli import CONFIG, recipe
-from recipes.common.models import open_policy
+from recipes.common.models import num_parameters, open_policy
 from recipes.studies.tables import Cell, StudyTable, tell
 
 
@@ -46,14 +47,12 @@ def realism_of_reference(comparison: Comparison, folder: Path) -> Interval:
     Raises:
         ValueError: the values of its scenes are not there.
     """
-    evaluations, values = Evaluations(folder), []
-    for row in comparison.base():
-        found = evaluations(row["file"])
-        if found is None:
-            raise ValueError(f"{folder / row['file']} is not there; the realism of the reference is in it.")
-        values.append(found["realism"])
-    there = [all(value is not None for value in scene) for scene in zip(*values, strict=True)]
-    return summary([[value for value, known in zip(row, there, strict=True) if known] for row in values])
+    rows = comparison.base()
+    values = scene_values([rows], ["realism"], Evaluations(folder))
+    if values is None:
+        files = ", ".join(row["file"] for row in rows)
+        raise ValueError(f"{folder} lacks values of its reference's scenes; the realism of all is in {files}.")
+    return summary(values[0, 0])
 
 
 def gain_of(comparison: Comparison, method: str) -> Interval:
@@ -69,7 +68,7 @@ def parameters_of(experiment: Experiment, folder: Path) -> float | None:
     policy = folder / f"seed_{experiment.seeds[0]}" / "reference" / "policy.pt"
     if not policy.is_file():
         return None
-    return sum(value.numel() for value in open_policy(policy, "cpu")[0].parameters()) / 1e6
+    return num_parameters(open_policy(policy, "cpu")[0]) / 1e6
 
 
 @hydra.main(**CONFIG, config_name="gains")

@@ -104,11 +104,12 @@ def pretrain(
     best = copy.deepcopy(model)
     train = training_items(cfg, splits.train, model, seed, ranks)
     tune = tuning_items(cfg, splits.tune, model, ranks)
-    trained = nn.ModuleDict({"policy": model, **auxiliary_of(model, options.auxiliary)}).to(device)
+    beside = auxiliary_of(model, options.auxiliary)
+    trained = nn.ModuleDict({"policy": model, **beside}).to(device)
     loss = NextTokenLoss(
         token_network(model, options.precision),
         label_smoothing=options.label_smoothing,
-        auxiliary=dict(trained).get("auxiliary"),
+        auxiliary=beside.get("auxiliary"),
         auxiliary_weight=options.auxiliary,
     )
     loss.set_keys(labels=keys.LABELS)

@@ -25,7 +25,7 @@ from dpa.report.studies import plot_references
 from dpa.training.loggers import read_curve
 from dpa.training.run import seconds_trained
 from recipes.common.cli import CONFIG, build, recipe
-from recipes.common.models import open_policy, policies_of
+from recipes.common.models import num_parameters, open_policy, policies_of
 from recipes.common.scenes import open_splits
 from recipes.evaluate import evaluate
 from recipes.studies.tables import Cell, StudyTable, tell
@@ -103,7 +103,7 @@ def main(cfg: DictConfig) -> None:
     rows, output, decoding = {}, Path(cfg.output), build(Decoding, cfg.decoding, "decoding")
     for name, path in policies.items():
         result = evaluate(cfg, scenes, path, decoding, cfg.seed, output / f"{name.replace('/', '_')}.json")
-        parameters = sum(value.numel() for value in open_policy(path, cfg.device)[0].parameters())
+        parameters = num_parameters(open_policy(path, cfg.device)[0])
         rows[name] = measured(trainings[name], result, parameters)
     realism = {name: row[COLUMNS.index("realism")] for name, row in rows.items()}
     curves = {name: training.curve for name, training in trainings.items()}

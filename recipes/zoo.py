@@ -28,7 +28,7 @@ from dpa.training.checkpoint import load_policy
 from dpa.training.run import seconds_trained
 from envs.files import write_json
 from recipes.common.cli import refused
-from recipes.common.models import build_policy, digest_of
+from recipes.common.models import build_policy, digest_of, num_parameters
 
 SHOWN = ("realism", "collision_rate", "offroad_rate", "min_ade")
 """Measures in the list; the cards have all."""
@@ -60,7 +60,7 @@ def make_card(run: Path, evaluations: dict[str, Path]) -> dict[str, Any]:
     told = read_json(run / "result.json")
     return {
         "sha256": zoo.checksum(file),
-        "parameters": sum(value.numel() for value in build_policy(config).parameters()),
+        "parameters": num_parameters(build_policy(config)),
         "hours": round(seconds_trained(run) / SECONDS_OF_AN_HOUR, 2),
         "tune_nll": made["tune_nll"],
         "seed": made["seed"],

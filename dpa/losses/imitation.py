@@ -52,6 +52,7 @@ class ImitationLoss(NextTokenLoss):
     out_keys = ["loss_next_token", "accuracy", "entropy", "kl"]
 
     def __init__(self, actor_network: TensorDictModule, *, label_smoothing: float = 0.0) -> None:
+        # An auxiliary loss is pre-training's alone.
         super().__init__(actor_network, label_smoothing=label_smoothing)
 
     def _diagnostics(self, batch: TensorDict, logits: Tensor) -> dict[str, Tensor]:

@@ -112,6 +112,11 @@ def write_policy(path: Path, model: MotionModel, config: dict[str, Any], metadat
     save_policy(path, model.state_dict(), config, metadata)
 
 
+def num_parameters(model: MotionModel) -> int:
+    """Parameters of a policy; motions of a vocabulary are none."""
+    return sum(value.numel() for value in model.parameters())
+
+
 def check_written(path: Path) -> None:
     """Refuse a finished training whose policy was damaged since.
 

@@ -103,6 +103,7 @@ class TurnMemory:
         found, self._nodes = decoder.begin(self._shown, seen.step, cast, self._scenes)
         pose, turns = self._shown.recent[:, :, -1], cast.takes.shape[1]
         self._agents = Agents(F.pad(found, (0, 0, 0, turns)), F.pad(pose, (0, 0, 0, turns)))
+        self._deciding = cast.takes & self._shown.valid[:, :turns]  # [B, C], the agent is there and takes its turn
         there = self._past.there & (seen.step > 0)[:, None, None]
         nobody = torch.zeros_like(cast.takes)
         self._see = torch.cat((self._shown.valid, nobody, nobody, there.flatten(1)), 1)
@@ -112,12 +113,6 @@ class TurnMemory:
             parts = zip(layer.remember(found, pose), past, strict=True)
             padded = ((F.pad(now, (0, 0, 0, 2 * turns)), before.flatten(2, 3)) for now, before in parts)
             self._layers.append(KeyValues(*(torch.cat(both, 2) for both in padded)))
-
-    @property
-    def _deciding(self) -> Tensor:
-        """``[B, C]`` bool, the agent is there and takes its turn."""
-        turns = self._cast.takes.shape[1]
-        return self._cast.takes & self._shown.valid[:, :turns]
 
     def _decide(self, turn: int) -> Tensor:
         """``[B, 1, V]`` logits of a turn, whose node is there for those to come."""
