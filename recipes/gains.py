@@ -76,6 +76,8 @@ def parameters_of(experiment: Experiment, folder: Path) -> float | None:
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.gains``."""
     methods, output = list(cfg.methods), Path(cfg.output)
+    if not cfg.runs or not methods:
+        raise ValueError(f"runs={list(cfg.runs)} and methods={methods} must name one or more each.")
     found = [(Path(runs), read(Path(runs), cfg.name, methods)) for runs in cfg.runs]
     labels = {method: found[0][1].labels[method] for method in methods}
     rows: dict[str, list[Cell]] = {}
@@ -98,7 +100,8 @@ def main(cfg: DictConfig) -> None:
         "realism of the reference",
         *(f"gain of {each}" for each in labels.values()),
     ]
-    title = f"{found[0][1].reported}, best decoding against best"
+    reported = ", ".join(dict.fromkeys(f"{each.reported} of {each.scenes['source']}" for _, each in found))
+    title = f"{reported}; best decoding against best"
     tell(cfg, [StudyTable("gains", title, columns, rows, signed=False)], {"gains": output / "gains.png"})
     print(f"figure: {output / 'gains.png'}")
 

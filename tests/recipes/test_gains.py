@@ -52,6 +52,7 @@ def test_the_table_has_the_differences_of_the_comparisons_and_the_realism_of_the
     [
         ("name=competent", "has no experiment 'competent'"),
         ("methods=[rloo]", "does not compare 'rloo' with its reference; it has dpa_omf, adversarial_afd"),
+        ("runs=[]", "runs=[] and methods=['dpa_omf', 'adversarial_afd'] must name one or more each"),
         ("runs=[{0},{0}]", "two of the runs are called 'first'"),
     ],
 )
