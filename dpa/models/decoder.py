@@ -9,6 +9,8 @@ from torch import Tensor, nn
 from dpa.models.attention import FeedForward, KeyValues, RelativeAttention
 from dpa.models.encoder import SceneMemory, SceneTokens
 from dpa.models.vicinity import NEAREST_AGENTS, NEAREST_PIECES, Vicinity
+from dpa.models.words import TokenEmbedding, TokenHead
+from dpa.tokens.base import MotionTokenizer
 from envs.scene import AgentKind
 
 
@@ -47,7 +49,7 @@ class NodeDecoder(nn.Module):
     """The parts of a decoder whose nodes are agents at decisions.
 
     Args:
-        vocab_size: V.
+        tokenizer: what a token means.
         width: channels.
         heads: attention heads.
         feed: inner channels of a feed-forward layer.
@@ -59,7 +61,7 @@ class NodeDecoder(nn.Module):
 
     def __init__(
         self,
-        vocab_size: int,
+        tokenizer: MotionTokenizer,
         width: int,
         heads: int,
         feed: int,
@@ -70,7 +72,7 @@ class NodeDecoder(nn.Module):
     ) -> None:
         super().__init__()
         self.motion = nn.Sequential(nn.Linear(8, width), nn.GELU(), nn.Linear(width, width))
-        self.token = nn.Embedding(vocab_size + 1, width)
+        self.token = TokenEmbedding(tokenizer, width)
         self.time = nn.Embedding(horizon, width)
         self.kind = nn.Embedding(len(AgentKind), width)
         self.identity = nn.Linear(width, width)
@@ -80,7 +82,7 @@ class NodeDecoder(nn.Module):
             DecoderLayer(attention(width, heads), width, heads, feed, dropout) for _ in range(layers)
         )
         self.norm = nn.LayerNorm(width)
-        self.head = nn.Linear(width, vocab_size)
+        self.head = TokenHead(width, tokenizer)
 
     def read_scene(self, tokens: SceneTokens, extent: Tensor) -> SceneMemory:
         """An encoded scene as the layers look at it."""

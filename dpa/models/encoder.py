@@ -9,7 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from dpa.models.attention import FeedForward, KeyValues, RelativeAttention
-from dpa.models.scene import NUM_LIGHT_STATES, PIECE_POINTS, POSITION_SCALE, SceneContext
+from dpa.models.pieces import NUM_LIGHT_STATES
+from dpa.models.scene import PIECE_POINTS, POSITION_SCALE, SceneContext
 from dpa.models.vicinity import Vicinity
 from envs.episode import HISTORY, Episode
 from envs.geometry.frames import rotate, wrap_angle

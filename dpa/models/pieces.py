@@ -10,10 +10,12 @@ from torch import Tensor
 
 from envs.episode import HISTORY
 from envs.geometry.frames import rotate, wrap_angle
-from envs.scene import CURRENT_STEP, LOG_STEPS, STEP_SECONDS, Agents, Lights, LightState, RoadMap, Scene
+from envs.scene import CURRENT_STEP, LANE_KINDS, LOG_STEPS, STEP_SECONDS, Agents, Lights, LightState, RoadMap, Scene
 
 GRID = 4.0
 """Places nearer to each other than this count as one in the choice of pieces [m]."""
+NUM_LIGHT_STATES = len(LightState)
+"""Of a piece or a light: states plus one, 0 for none."""
 ROUNDING = 1e-3
 """Of a piece: by so much a line may be too long without a further piece, wherever a scene lies."""
 
@@ -91,6 +93,8 @@ def cut_map(scene: Scene, steps: int, options: PieceOptions, num_points: int, *,
     points, middle, owner = points[near], middle[near], owner[near]
     chord = points[:, -1] - points[:, 0]
     heading = torch.atan2(chord[:, 1], chord[:, 0])
+    lone = (chord == 0).all(-1)  # stop signs
+    heading[lone] = headings_of_nearest_lanes(road, middle[lone])
     local = rotate(points - middle[:, None], -heading[:, None])
     state = torch.zeros(len(road.kind), dtype=torch.int64)
     for lane, now in zip(lights.lane_id.tolist(), lights.state[:, CURRENT_STEP].tolist(), strict=True):
@@ -157,7 +161,7 @@ def _even(road: RoadMap, length: float, num: int) -> tuple[Tensor, Tensor]:
 
 
 def light_poses(road: RoadMap, lights: Lights) -> Tensor:
-    """``[G, 3]``: stop points, headed along the lane at its nearest point; 0 heading for a lane that the map lacks."""
+    """``[G, 3]``: stop points, headed along their lane at its nearest point, or along the nearest lane."""
     poses = torch.zeros(len(lights.lane_id), 3)
     if not len(poses):
         return poses
@@ -169,7 +173,25 @@ def light_poses(road: RoadMap, lights: Lights) -> Tensor:
     if known.any():
         owner = lane[known].int().argmax(-1)
         poses[known, 2] = _lane_headings(road, owner, poses[known, :2])
+    poses[~known, 2] = headings_of_nearest_lanes(road, poses[~known, :2])
     return poses
+
+
+def headings_of_nearest_lanes(road: RoadMap, places: Tensor) -> Tensor:
+    """``[n]``: what has a place ``[n, 2]`` but no direction is headed along the nearest lane; 0 without lanes.
+
+    Examples:
+        >>> from envs.sources.synthetic import straight_road
+        >>> headings_of_nearest_lanes(straight_road(2).road, torch.tensor([[10.0, 4.0]])).sin().abs() < 1e-6
+        tensor([True])
+    """
+    owner = torch.repeat_interleave(torch.arange(len(road.count)), road.count)
+    lane = torch.isin(road.kind, torch.tensor(LANE_KINDS)) & (road.count > 1)
+    points = lane[owner].nonzero()[:, 0]
+    if not len(points) or not len(places):
+        return places.new_zeros(len(places))
+    nearest = torch.cdist(places, road.points[points, :2]).argmin(1)
+    return _lane_headings(road, owner[points[nearest]], places)
 
 
 def _lane_headings(road: RoadMap, owner: Tensor, places: Tensor) -> Tensor:

@@ -21,7 +21,6 @@ PIECE_POINTS = 5
 """Points that describe a piece."""
 POSITION_SCALE = 10.0
 """Metres that count as one in a feature."""
-NUM_LIGHT_STATES = len(LightState)
 
 
 @dataclass(frozen=True)

@@ -43,11 +43,13 @@ class MotionTokenizer(nn.Module):
         vocab_size: V; 0 where there is no vocabulary.
         steps: F, poses of 0.1 s in one token.
         shape: of one token, ``()`` for an index.
+        meanings: of one token: 1, or one for each class of agent.
     """
 
     vocab_size: int
     steps: int
     shape: tuple[int, ...] = ()
+    meanings: int = 1
 
     @property
     def dtype(self) -> torch.dtype:

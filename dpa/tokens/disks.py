@@ -45,6 +45,8 @@ class KDisksTokenizer(MotionTokenizer):
         tensor([0])
     """
 
+    meanings = len(AgentKind)
+
     def __init__(self, steps: int, size: int, digest: str) -> None:
         super().__init__()
         if steps < 1 or size < 1:
@@ -118,13 +120,38 @@ class KDisksTokenizer(MotionTokenizer):
     def neighbour(self, token: Tensor, kind: Tensor, drawn: Tensor) -> Tensor:
         """One of the :data:`NEAR` entries nearest to each, itself among them."""
         if self._near is None:
-            apart = torch.cdist(self.points, self.points)
-            self._near = apart.topk(min(NEAR, self.vocab_size), largest=False).indices
+            self._near = torch.stack([nearest_others(points, NEAR) for points in self.points])
         return self._near[kind, token, (self._near.shape[-1] * drawn[..., 0]).long()]
 
     def extra_repr(self) -> str:
         """Options, for ``print``."""
         return f"V={self.vocab_size}, F={self.steps} ({self.steps * STEP_SECONDS:.1f} s), {self.digest}"
+
+
+def nearest_others(points: Tensor, count: int) -> Tensor:
+    """The nearest entries of each entry, itself among them.
+
+    A class of few motions is filled up with copies, among which nothing would be drawn: they count for none. Where
+    there are fewer other motions than asked for, the entry itself stands for the rest.
+
+    Args:
+        points: ``[V, C]``.
+        count: entries for each.
+
+    Returns:
+        ``[V, min(count, V)]`` indices.
+
+    Examples:
+        >>> nearest_others(torch.tensor([[0.0], [1.0], [5.0], [0.0]]), 3)
+        tensor([[0, 1, 2],
+                [1, 0, 2],
+                [2, 1, 0],
+                [0, 1, 2]])
+    """
+    apart = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist")
+    copies = (apart == 0).tril(-1).any(1)
+    square, index = apart.masked_fill(copies, torch.inf).topk(min(count, len(points)), largest=False)
+    return torch.where(square.isfinite(), index, index[:, :1])
 
 
 def _measure(tokenizer: KDisksTokenizer, _: object) -> None:

@@ -36,7 +36,8 @@ class PatchTokenizer(MotionTokenizer):
         >>> tokenizer = PatchTokenizer(steps=10)
         >>> recent, kind = torch.zeros(1, 11, 3), torch.tensor([1])
         >>> target = torch.rand(1, 10, 3)
-        >>> torch.allclose(tokenizer.decode(tokenizer.encode(target, recent, kind), recent, kind), target)
+        >>> again = tokenizer.decode(tokenizer.encode(target, recent, kind), recent, kind)
+        >>> torch.allclose(again, target, atol=1e-5)
         True
     """
 

@@ -21,6 +21,8 @@ SCHEDULES = ("linear", "cosine")
 MUON_SIDE = 32
 """Rows and columns that a matrix has at least to be made orthogonal; the thin ones of input features are AdamW's."""
 EMBEDDINGS = (nn.Embedding, nn.EmbeddingBag)
+SPARED = ("embedding", "bias", "frequency")
+"""Ends of the names of bare parameters that are not decayed, whatever their shape."""
 BETAS = (0.9, 0.95)
 """Decay rates of AdamW's moments; 0.95 is usual for transformers, whose gradients have heavy tails."""
 
@@ -37,7 +39,7 @@ def make_optimizer(
 
     Decay pulls towards zero. That regularises the matrices of linear maps, but it shrinks the scale of a norm and the
     rows of tokens that a batch does not contain. Parameters of fewer than two dimensions, those of embedding modules,
-    and bare parameters whose name ends in ``embedding`` are not decayed.
+    and bare parameters whose name ends in one of :data:`SPARED` are not decayed.
 
     Args:
         module: whatever holds the parameters to train; those that need no gradient are left out.
@@ -63,7 +65,7 @@ def make_optimizer(
     for name, parameter in module.named_parameters():
         if not parameter.requires_grad:
             continue
-        spare = parameter.ndim < 2 or id(parameter) in embeddings or name.endswith("embedding")
+        spare = parameter.ndim < 2 or id(parameter) in embeddings or name.endswith(SPARED)
         (spared if spare else decayed).append(parameter)
     if not decayed and not spared:
         raise ValueError(f"{type(module).__name__} has no parameter that needs a gradient; unfreeze some of it.")

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from dpa.models.base import named_size
 from dpa.models.behaviorgpt.mixture import PatchMixture
-from dpa.models.factorised import METRES, FactorisedConfig, FactorisedModel, NeighbourhoodOptions, mlp
+from dpa.models.factorised import METRES, FactorisedConfig, FactorisedModel, NeighbourhoodOptions, mlp, quiet
 from dpa.tokens.base import MotionTokenizer
 from envs.geometry.frames import rotate, to_local
 from envs.scene import AgentKind
@@ -76,7 +76,7 @@ class BehaviorGPT(FactorisedModel):
         super().__init__(config, tokenizer, context)
         self.distribution = PatchMixture(tokenizer.steps)
         width, inner = config.width, config.frame_width
-        self.kind = nn.Embedding(len(AgentKind), width)
+        self.kind = quiet(nn.Embedding(len(AgentKind), width))
         self.frame, self.key, self.value = mlp(7, inner), nn.Linear(inner, inner), nn.Linear(inner, width)
         self.own = mlp(3, width)
         self.weight = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, config.modes + 1))
@@ -109,7 +109,7 @@ class BehaviorGPT(FactorisedModel):
         new = (new + (reset + forget).sigmoid() * said).tanh()
         return new + (keep + hold).sigmoid() * (state - new)
 
-    def decide(self, x: Tensor, recent: Tensor) -> Tensor:
+    def decide(self, x: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
         """See :meth:`~dpa.models.factorised.FactorisedModel.decide`: a row of :class:`Mixture` numbers."""
         hidden = (self.start(x)[..., None, :] + self.mode.weight).tanh()  # [*, K, inner]
         shape, state, frames = hidden.shape, hidden.flatten(0, -2), []

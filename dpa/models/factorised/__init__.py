@@ -2,7 +2,7 @@
 
 from dpa.models.factorised.context import NeighbourhoodContext, NeighbourhoodOptions, featurize
 from dpa.models.factorised.edges import METRES
-from dpa.models.factorised.model import FactorisedConfig, FactorisedModel, mlp
+from dpa.models.factorised.model import FactorisedConfig, FactorisedModel, mlp, quiet
 
 __all__ = [
     "METRES",
@@ -12,4 +12,5 @@ __all__ = [
     "NeighbourhoodOptions",
     "featurize",
     "mlp",
+    "quiet",
 ]

@@ -19,6 +19,8 @@ from envs.geometry.frames import to_local
 
 METRES = 10.0
 """Metres that count as one in a feature."""
+PERIODS = 0.2, 6.0
+"""Shortest and longest period of the first waves, in what counts as one: 2 m and 60 m of a place."""
 SECONDS = 1.0
 """Seconds that count as one."""
 CPU_EDGES = 4096
@@ -54,7 +56,8 @@ class FourierEmbedding(nn.Module):
 
     def __init__(self, inputs: int, width: int, frequencies: int) -> None:
         super().__init__()
-        self.frequency = nn.Parameter(torch.randn(inputs, frequencies))
+        waves = torch.logspace(-math.log10(PERIODS[1]), -math.log10(PERIODS[0]), frequencies)
+        self.frequency = nn.Parameter(waves.expand(inputs, -1).clone())
         self.first = nn.Parameter(torch.empty(inputs, 2 * frequencies + 1, width))
         self.bias = nn.Parameter(torch.zeros(inputs, 1, width))
         self.norm, self.out = nn.LayerNorm(width), nn.Linear(width, width)

@@ -21,11 +21,14 @@ from dpa.models.factorised.context import PIECE_POINTS, NeighbourhoodContext, Ne
 from dpa.models.factorised.edges import METRES, SECONDS, EdgeAttention, Edges, FourierEmbedding, relative
 from dpa.models.forcing import shown_by
 from dpa.models.neighbours import gather, nearest, rows_of
+from dpa.models.pieces import NUM_LIGHT_STATES
 from dpa.tokens.base import MotionTokenizer
 from envs.episode import HISTORY
 from envs.geometry.frames import to_world
-from envs.scene import NUM_MAP_KINDS, STEP_SECONDS, LightState
+from envs.scene import NUM_MAP_KINDS, STEP_SECONDS
 
+QUIET = 0.1
+"""Standard deviation of embeddings at first."""
 LOOK_AHEAD = 2.0
 """An agent sees the map around it, and around where it will be so much later at its speed [s]: lights and bends."""
 
@@ -97,7 +100,8 @@ class FactorisedModel(MotionModel):
         self.config, self.tokenizer, self.context = config, tokenizer, context or NeighbourhoodOptions()
         width = config.width
         self.piece = mlp(PIECE_POINTS * 2, width)
-        self.piece_kind, self.piece_light = nn.Embedding(NUM_MAP_KINDS, width), nn.Embedding(len(LightState) + 1, width)
+        self.piece_kind = quiet(nn.Embedding(NUM_MAP_KINDS, width))
+        self.piece_light = quiet(nn.Embedding(NUM_LIGHT_STATES, width))
         embed = partial(FourierEmbedding, width=width, frequencies=config.frequencies)
         self.map_edge, self.past_edge, self.agent_map_edge, self.agent_edge = embed(4), embed(5), embed(4), embed(4)
         sizes = (width, config.heads, config.feed * width, config.dropout)
@@ -117,12 +121,13 @@ class FactorisedModel(MotionModel):
         """
 
     @abstractmethod
-    def decide(self, x: Tensor, recent: Tensor) -> Tensor:
+    def decide(self, x: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
         """Logits ``[*, P]`` of nodes.
 
         Args:
             x: ``[*, width]``.
             recent: ``[*, F + 1, 3]``.
+            kind: ``[*]``.
         """
 
     @property
@@ -172,13 +177,14 @@ class FactorisedModel(MotionModel):
             x = layer.map(x, layer.map.remember(pieces), map_edges)
             x = layer.agents(x, layer.agents.remember(x), agent_edges)
         x = x.view(scenes, rollouts, decisions, agents, -1)[:, :, -horizon:]
-        return self.decide(self.norm(x), shown.recent).transpose(2, 3)
+        kind = context.episode.kind[:, None, None].expand(-1, rollouts, horizon, -1)
+        return self.decide(self.norm(x), shown.recent, kind).transpose(2, 3)
 
     def history(self, context: NeighbourhoodContext) -> tuple[Tensor, Tensor]:
         """Decisions that the log took before the episode, but for the last one, which ``recent`` shows.
 
         Returns:
-            ``[S, H, A, F + 1, 3]`` poses and ``[S, H, A]`` bool, both ends of the decision are logged.
+            ``[S, H, A, F + 1, 3]`` poses and ``[S, H, A]`` bool, all of the decision is logged.
         """
         episode, steps = context.episode, self.tokenizer.steps
         count = (HISTORY - 1) // steps - 1
@@ -186,8 +192,8 @@ class FactorisedModel(MotionModel):
         poses = to_world(episode.history, episode.recent[:, :, -1:])[:, :, first:]
         seen = episode.history_valid[:, :, first:]
         decisions = poses.unfold(2, steps + 1, steps)[:, :, :count].movedim(-1, -2)  # [S, A, H, F + 1, 3]
-        ends = seen.unfold(2, steps + 1, steps)[:, :, :count]
-        return decisions.transpose(1, 2), (ends[..., 0] & ends[..., -1] & episode.valid[..., None]).transpose(1, 2)
+        whole = seen.unfold(2, steps + 1, steps)[:, :, :count].all(-1)
+        return decisions.transpose(1, 2), (whole & episode.valid[..., None]).transpose(1, 2)
 
     def _edges(
         self,
@@ -318,7 +324,7 @@ class FactorisedMemory:
         """See :meth:`dpa.models.base.Memory.step`."""
         before = self._logged.map(partial(starting, seen.step == 0), self._past)
         x, self._past = self._advance(before, seen, self._extent)
-        logits = self.model.decide(self.model.norm(x), seen.recent).float()
+        logits = self.model.decide(self.model.norm(x), seen.recent, seen.kind).float()
         return Decision(choose(logits), logits)
 
     def _advance(self, past: Past, seen: Observation, extent: Tensor) -> tuple[Tensor, Past]:
@@ -349,6 +355,12 @@ class FactorisedMemory:
 def starting(begins: Tensor, first: Tensor, later: Tensor) -> Tensor:
     """Rows that begin have the first, the others the later."""
     return torch.where(begins.view(-1, *(1,) * (first.dim() - 1)), first, later)
+
+
+def quiet(embedding: nn.Embedding) -> nn.Embedding:
+    """An embedding that at first says little beside the features that it is added to."""
+    nn.init.normal_(embedding.weight, std=QUIET)
+    return embedding
 
 
 def mlp(inputs: int, width: int) -> nn.Sequential:

@@ -16,6 +16,7 @@ from torch import Tensor
 from dpa.models.attention import GAZE, KeyValues, NodeAttention, NodeMasks, added
 from dpa.models.decoder import NodeDecoder
 from dpa.models.encoder import SceneMemory, motion_features
+from dpa.tokens.base import MotionTokenizer
 
 
 class NodeInputs(NamedTuple):
@@ -40,7 +41,7 @@ class MotionDecoder(NodeDecoder):
     """Logits of the next token of every node.
 
     Args:
-        vocab_size: V.
+        tokenizer: what a token means.
         width: channels.
         heads: attention heads.
         feed: inner channels of a feed-forward layer.
@@ -50,9 +51,16 @@ class MotionDecoder(NodeDecoder):
     """
 
     def __init__(
-        self, vocab_size: int, width: int, heads: int, feed: int, layers: int, horizon: int, dropout: float = 0.0
+        self,
+        tokenizer: MotionTokenizer,
+        width: int,
+        heads: int,
+        feed: int,
+        layers: int,
+        horizon: int,
+        dropout: float = 0.0,
     ) -> None:
-        super().__init__(vocab_size, width, heads, feed, layers, horizon, dropout, NodeAttention)
+        super().__init__(tokenizer, width, heads, feed, layers, horizon, dropout, NodeAttention)
 
     def forward(
         self,
@@ -79,7 +87,7 @@ class MotionDecoder(NodeDecoder):
             seen = own if cache is None else cache.add(index, own)
             look = partial(layer.nodes, pose=pose, memory=seen, masks=masks, agents=agents)
             x = layer(x, pose, look, memory, index)
-        return self.head(self.norm(x))
+        return self.head(self.norm(x), nodes.kind)
 
     def _look_around(self, x: Tensor, nodes: NodeInputs, memory: SceneMemory) -> Tensor:
         """Add what lies next to each node: map pieces and lights, and the other agents at the same decision."""
@@ -100,7 +108,7 @@ class MotionDecoder(NodeDecoder):
 
         motion = self.motion(motion_features(nodes.recent, each_node(memory.extent)))
         who = each_node(self.identity(memory.agents))
-        return motion + self.token(nodes.token) + self.time(nodes.step) + self.kind(nodes.kind) + who
+        return motion + self.token(nodes.token, nodes.kind) + self.time(nodes.step) + self.kind(nodes.kind) + who
 
 
 class NodeCache:

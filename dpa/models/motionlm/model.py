@@ -81,7 +81,7 @@ class MotionLM(MotionModel):
         self.config, self.tokenizer, self.context = config, tokenizer, context or ContextOptions()
         size = (config.width, config.heads, config.feed)
         self.encoder = SceneEncoder(*size, config.encoder_layers, config.dropout)
-        self.decoder = MotionDecoder(tokenizer.vocab_size, *size, config.decoder_layers, config.horizon, config.dropout)
+        self.decoder = MotionDecoder(tokenizer, *size, config.decoder_layers, config.horizon, config.dropout)
 
     @property
     def featurize(self) -> Featurize:

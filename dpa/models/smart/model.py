@@ -6,14 +6,16 @@ import torch
 from torch import Tensor, nn
 
 from dpa.models.base import Auxiliary, named_size
-from dpa.models.factorised import METRES, FactorisedConfig, FactorisedModel, NeighbourhoodOptions, mlp
+from dpa.models.factorised import METRES, FactorisedConfig, FactorisedModel, NeighbourhoodOptions, mlp, quiet
 from dpa.models.smart.road import NextPiece
+from dpa.models.words import TokenEmbedding, TokenHead
 from dpa.tokens.base import MotionTokenizer, check_vocabulary
 from envs.geometry.frames import to_local
 from envs.scene import AgentKind
 
 SIZES: dict[str, FactorisedConfig] = {
-    "nano": FactorisedConfig(width=36, heads=4, map_layers=1, agent_layers=2, frequencies=8, feed=2),
+    "nano": FactorisedConfig(width=36, heads=4, map_layers=1, agent_layers=2, frequencies=8, feed=2,
+                             map_pieces=16),
     "1m": FactorisedConfig(width=64, heads=4, map_layers=2, agent_layers=4, frequencies=64, feed=3, past=4,
                            agent_map_radius=20.0, map_pieces=16, agent_pieces=32),
     "7m": FactorisedConfig(width=128, heads=8, map_layers=3, agent_layers=6, frequencies=64, map_pieces=32,
@@ -50,21 +52,22 @@ class SMART(FactorisedModel):
         self, config: FactorisedConfig | str, tokenizer: MotionTokenizer, context: NeighbourhoodOptions | None = None
     ) -> None:
         super().__init__(named_size(config, SIZES), check_vocabulary(tokenizer, "SMART"), context)
-        width, words = self.config.width, tokenizer.vocab_size
-        self.token, self.kind = nn.Embedding(words + 1, width), nn.Embedding(len(AgentKind), width)
+        width = self.config.width
+        self.token, self.kind = quiet(TokenEmbedding(tokenizer, width)), quiet(nn.Embedding(len(AgentKind), width))
         self.motion = mlp(7, width)
-        self.head = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, words))
+        self.said = nn.Sequential(nn.Linear(width, width), nn.ReLU())
+        self.head = TokenHead(width, tokenizer)
 
     def embed(self, recent: Tensor, token: Tensor, kind: Tensor, extent: Tensor) -> Tensor:
         """See :meth:`~dpa.models.factorised.FactorisedModel.embed`: the token, and where it led."""
         moved = to_local(recent[:, :, 0], recent[:, :, -1])  # where it was, from where it is
         length, turned = moved[..., :2].norm(dim=-1, keepdim=True), moved[..., 2:]
         motion = self.motion(torch.cat((moved[..., :2] / METRES, length / METRES, turned, extent / METRES), -1))
-        return motion + self.token(token) + self.kind(kind)
+        return motion + self.token(token, kind) + self.kind(kind)
 
-    def decide(self, x: Tensor, recent: Tensor) -> Tensor:
+    def decide(self, x: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
         """See :meth:`~dpa.models.factorised.FactorisedModel.decide`: logits of all tokens."""
-        return self.head(x)
+        return self.head(self.said(x), kind)
 
     def auxiliary(self) -> Auxiliary:
         """See :meth:`~dpa.models.base.MotionModel.auxiliary`: which way a lane goes on."""

@@ -21,6 +21,7 @@ from dpa.models.attention import DECISIONS, KeyValues, NodeAttention, added
 from dpa.models.decoder import NodeDecoder
 from dpa.models.encoder import SceneMemory, motion_features
 from dpa.models.forcing import Shown
+from dpa.tokens.base import MotionTokenizer
 
 
 class Cast(NamedTuple):
@@ -139,7 +140,7 @@ class TurnDecoder(NodeDecoder):
     """Logits of the token of every turn.
 
     Args:
-        vocab_size: V.
+        tokenizer: what a token means.
         width: channels.
         heads: attention heads.
         feed: inner channels of a feed-forward layer.
@@ -152,7 +153,7 @@ class TurnDecoder(NodeDecoder):
 
     def __init__(
         self,
-        vocab_size: int,
+        tokenizer: MotionTokenizer,
         width: int,
         heads: int,
         feed: int,
@@ -162,13 +163,13 @@ class TurnDecoder(NodeDecoder):
         joint: bool = True,
         dropout: float = 0.0,
     ) -> None:
-        super().__init__(vocab_size, width, heads, feed, layers, horizon, dropout, TurnAttention)
+        super().__init__(tokenizer, width, heads, feed, layers, horizon, dropout, TurnAttention)
         self.past, self.joint = past, joint
         self.chosen = nn.Parameter(torch.zeros(width))
 
-    def embed(self, recent: Tensor, token: Tensor, extent: Tensor, who: Tensor) -> Tensor:
+    def embed(self, recent: Tensor, token: Tensor, kind: Tensor, extent: Tensor, who: Tensor) -> Tensor:
         """``[*, width]``: agents with the motion ``[*, F + 1, 3]`` and the token ``[*]`` that they made last."""
-        return self.motion(motion_features(recent, extent)) + self.token(token) + who
+        return self.motion(motion_features(recent, extent)) + self.token(token, kind) + who
 
     # --- all decisions at once --------------------------------------------------------------------------------------
     def forward(self, shown: Shown, chosen: Shown, cast: Cast, memory: SceneMemory) -> Tensor:
@@ -184,9 +185,12 @@ class TurnDecoder(NodeDecoder):
             ``[B, T, C, V]``.
         """
         horizon, turns = chosen.token.shape[1:]
-        extent, who = (value[:, None].expand(-1, horizon, -1, -1) for value in (cast.extent, cast.who))
-        x = self.embed(shown.recent, shown.token, extent, who)
-        after = self.embed(chosen.recent, chosen.token, extent[:, :, :turns], who[:, :, :turns]) + self.chosen
+        kind, extent, who = (
+            value[:, None].expand(-1, horizon, *value.shape[1:]) for value in (cast.kind, cast.extent, cast.who)
+        )
+        deciding = (value[:, :, :turns] for value in (kind, extent, who))
+        x = self.embed(shown.recent, shown.token, kind, extent, who)
+        after = self.embed(chosen.recent, chosen.token, *deciding) + self.chosen
         agents = torch.cat((x, after), 2)  # [B, T, A + C, width]
         places = torch.cat((shown.recent[..., -1, :], chosen.recent[..., -1, :]), 2)
         seen = standing(shown.valid, chosen.valid)
@@ -202,7 +206,7 @@ class TurnDecoder(NodeDecoder):
             views = _views(lots, nodes, others)
             look = partial(layer.nodes, pose=pose, own=nodes, own_mask=own_past, turns=turns, views=views)
             x = layer(x, pose, look, memory, index)
-        return self.head(self.norm(x)).unflatten(1, (horizon, turns))
+        return self.head(self.norm(x).unflatten(1, (horizon, turns)), kind[:, :, :turns])
 
     def _lots(self, there: Tensor, seen: Tensor) -> list[Lot]:
         """What nodes see, some decisions at a time.
@@ -239,7 +243,7 @@ class TurnDecoder(NodeDecoder):
             memory: of the S scenes.
         """
         turns = cast.takes.shape[1]
-        agents = self.embed(shown.recent, shown.token, cast.extent, cast.who)
+        agents = self.embed(shown.recent, shown.token, cast.kind, cast.extent, cast.who)
         around = memory.look_around(self.map_vicinity, shown.recent[:, :turns, -1])
         return agents, agents[:, :turns] + self.time(step)[:, None] + around
 

@@ -128,7 +128,7 @@ class TurnMemory:
             along, views = KeyValues(*(each[:, :, node::turns] for each in held)), [View(slice(None), held, mask)]
             look = partial(layer.nodes, pose=pose, own=along, own_mask=own_past, turns=1, views=views)
             x = layer(x, pose, look, self._scenes, index)
-        return decoder.head(decoder.norm(x)).float()
+        return decoder.head(decoder.norm(x), self._cast.kind[:, own]).float()
 
     def _take(self, turn: int, token: Tensor) -> None:
         """An agent has decided: from now on it stands where its token ``[B, 1]`` leads."""
@@ -136,7 +136,7 @@ class TurnMemory:
         turns, agents = self._counts
         recent = self.model.tokenizer.advance(token, self._shown.recent[:, own], cast.kind[:, own])
         pose = recent[:, :, -1]
-        x = decoder.embed(recent, token, cast.extent[:, own], cast.who[:, own]) + decoder.chosen
+        x = decoder.embed(recent, token, cast.kind[:, own], cast.extent[:, own], cast.who[:, own]) + decoder.chosen
         self._agents.x[:, agents + turn], self._agents.pose[:, agents + turn] = x[:, 0], pose[:, 0]
         for layer, held in zip(decoder.layers, self._layers, strict=True):
             _write(held, agents + turn, layer.remember(x, pose))

@@ -91,7 +91,7 @@ class Trajeglish(MotionModel):
         size = (config.width, config.heads, config.feed)
         self.encoder = SceneEncoder(*size, config.encoder_layers, config.dropout)
         self.decoder = TurnDecoder(
-            tokenizer.vocab_size,
+            tokenizer,
             *size,
             config.decoder_layers,
             config.horizon,

@@ -15,12 +15,14 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from dpa.models import Contexts, MotionActor, MotionModel, collate_contexts, make_context
 from dpa.models.context import keep_agents, pad_context
+from dpa.models.words import TokenEmbedding, TokenHead
 from dpa.tokens import KDisksTokenizer, MotionTokenizer, TokenAction
 from envs import keys
 from envs.episode import EpisodeOptions
-from envs.scene import Scene
+from envs.scene import AgentKind, MapKind, Scene
+from envs.sources.synthetic import build_scene
 from envs.traffic import TrafficEnv
-from tests.dpa.families import families, families_of_tokens, smallest, tokens_of
+from tests.dpa.families import TOKENIZERS, families, families_of_tokens, smallest, tokens_of
 
 
 def make(family: str, tokenizer: MotionTokenizer | None = None, horizon: int = 16) -> MotionModel:
@@ -117,6 +119,42 @@ def test_where_a_scene_lies_changes_nothing(family: str, motion: tuple, scene: C
     model = make(family)
     tokens = tokens_for(model, 3)
     here, there = scene(3), move(scene(3), torch.tensor(motion))
+    mine, other = (logits_of(model, make_context(each, model.featurize), tokens) for each in (here, there))
+    torch.testing.assert_close(other, mine, atol=2e-3, rtol=0)
+
+
+@families_of_tokens
+def test_where_a_token_means_another_motion_for_each_class_each_has_its_own_logits_and_embeddings(family: str) -> None:
+    model = make(family, TOKENIZERS["k_disks"]())
+    words, (head,) = model.tokenizer.vocab_size, [each for each in model.modules() if isinstance(each, TokenHead)]
+    (embedding,) = [each for each in model.modules() if isinstance(each, TokenEmbedding)]
+    kinds = torch.arange(len(AgentKind))
+    with torch.no_grad():
+        head.bias.copy_(torch.arange(len(head.bias)).float())
+        embedding.weight.copy_(torch.arange(len(embedding.weight))[:, None].expand_as(embedding.weight))
+    logits = head(torch.zeros(len(kinds), head.in_features), kinds)
+    assert logits.tolist() == [[float(kind * words + word) for word in range(words)] for kind in kinds.tolist()]
+    rows = embedding(torch.tensor([[0], [words]]).expand(2, len(kinds)), kinds)[..., 0]
+    assert rows.flatten().unique().numel() == 2 * len(kinds), "no token, too, is one for each class"
+
+
+@families_of_tokens
+def test_where_a_token_means_the_same_for_all_they_share_logits_and_embeddings(family: str) -> None:
+    model = make(family)
+    (head,) = [each for each in model.modules() if isinstance(each, TokenHead)]
+    (embedding,) = [each for each in model.modules() if isinstance(each, TokenEmbedding)]
+    assert head.out_features == model.tokenizer.vocab_size == embedding.num_embeddings - 1
+
+
+@families
+def test_a_stop_sign_turns_with_its_scene(family: str, move: Callable) -> None:
+    model, tokens = make(family), tokens_for(make(family), 2)
+    lane = torch.stack((torch.linspace(-20, 38, 30), torch.zeros(30)), -1)
+    lines = [(MapKind.LANE_SURFACE_STREET, lane), (MapKind.STOP_SIGN, torch.tensor([[9.0, 4.0]]))]
+    positions = torch.zeros(2, 91, 3)
+    positions[..., 0] = torch.arange(91) * 0.5 - torch.tensor([[0.0], [12.0]])
+    here = build_scene(positions, lines)
+    there = move(here, torch.tensor((30.0, -5.0, 1.1)))
     mine, other = (logits_of(model, make_context(each, model.featurize), tokens) for each in (here, there))
     torch.testing.assert_close(other, mine, atol=2e-3, rtol=0)
 

@@ -149,6 +149,26 @@ def test_noise_takes_one_of_the_nearest_entries() -> None:
         assert (order == near[:, None]).any(-1).float().mean() > 0.9, "but for ties"
 
 
+def test_noise_leaves_a_class_of_few_motions_for_one_of_its_others() -> None:
+    few = torch.zeros(8, 5, 3)
+    few[..., 0] = torch.arange(8)[:, None] * torch.linspace(0.2, 1, 5)
+    few = few.repeat(5, 1, 1)  # as a class is filled up
+    tokenizer = KDisksTokenizer.of(stacked({VEHICLE: few}))
+    token = torch.arange(tokenizer.vocab_size)
+    kind = torch.full_like(token, int(VEHICLE))
+    moved = torch.zeros(len(token))
+    for drawn in torch.linspace(0.1, 0.9, 5):  # each of the five nearest once
+        near = tokenizer.neighbour(token, kind, drawn.expand(len(token), 2))
+        moved += (apart(few[near], few[token]).diagonal() > 0).float()
+    assert (moved == 4).all(), "one of five leaves a token as it is"
+
+
+def test_a_single_motion_has_itself_for_a_neighbour() -> None:
+    tokenizer = KDisksTokenizer.of(stacked({VEHICLE: MOTIONS[:1].repeat(6, 1, 1)}))
+    near = tokenizer.neighbour(torch.zeros(3, dtype=torch.int64), torch.tensor([1, 1, 1]), torch.rand(3, 2))
+    assert near.tolist() == [0, 0, 0]
+
+
 # --- in a policy ----------------------------------------------------------------------------------------------------
 def test_a_policy_brings_its_motions_in_its_weights() -> None:
     tokenizer = tokenizer_of()

@@ -22,6 +22,7 @@ VEHICLE, PEDESTRIAN, CYCLIST = AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKin
 FRAMES, INTERPOLATIONS = ("current", "scene"), ("linear", "quadratic")
 tokenizers = st.builds(VerletTokenizer, interpolation=st.sampled_from(INTERPOLATIONS), frame=st.sampled_from(FRAMES))
 kinds = st.sampled_from([VEHICLE, PEDESTRIAN, CYCLIST, AgentKind.OTHER])
+# Of changes that add up to less than the reach of a pedestrian at 2 m/s: beyond it, several mean the same.
 small_changes = st.lists(st.tuples(st.integers(-3, 3), st.integers(-3, 3)), min_size=16, max_size=16)
 
 
@@ -43,7 +44,7 @@ def decode(tokenizer: VerletTokenizer, tokens: list[int], recent: Tensor, kind: 
 
 # --- round trips ----------------------------------------------------------------------------------------------------
 @FEW
-@given(tokenizers, small_changes, kinds, st.floats(0, 5), st.floats(-math.pi, math.pi), st.floats(-300, 300))
+@given(tokenizers, small_changes, kinds, st.floats(0, 1), st.floats(-math.pi, math.pi), st.floats(-300, 300))
 def test_tokens_decode_to_poses_that_encode_to_the_same_tokens(
     tokenizer: VerletTokenizer, changes: list, kind: int, metres: float, heading: float, x: float
 ) -> None:

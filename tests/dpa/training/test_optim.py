@@ -19,6 +19,7 @@ class Net(nn.Module):
         super().__init__()
         self.tokens = nn.Embedding(5, 4)
         self.step_embedding = nn.Parameter(torch.zeros(3, 4))
+        self.frequency, self.bias = nn.Parameter(torch.zeros(3, 4)), nn.Parameter(torch.zeros(3, 1, 4))
         self.body = nn.TransformerEncoderLayer(4, 2, 8, batch_first=True)
         self.frozen = nn.Linear(4, 4).requires_grad_(False)
 

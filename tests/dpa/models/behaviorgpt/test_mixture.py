@@ -158,7 +158,7 @@ def test_an_untrained_policy_goes_on_as_agents_do() -> None:
     recent = torch.zeros(1, 11, 3)
     recent[0, :, 0] = 0.5 * torch.arange(11)
     with torch.no_grad():
-        patch = model.distribution.likeliest(model.decide(torch.randn(1, 36), recent)).view(10, 3)
+        patch = model.distribution.likeliest(model.decide(torch.randn(1, 36), recent, torch.tensor([1]))).view(10, 3)
     torch.testing.assert_close(patch[:, 0], 0.5 * torch.arange(1.0, 11.0), atol=0.3, rtol=0)
 
 
