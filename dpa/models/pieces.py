@@ -93,7 +93,7 @@ def cut_map(scene: Scene, steps: int, options: PieceOptions, num_points: int, *,
     points, middle, owner = points[near], middle[near], owner[near]
     chord = points[:, -1] - points[:, 0]
     heading = torch.atan2(chord[:, 1], chord[:, 0])
-    lone = (chord == 0).all(-1)  # stop signs
+    lone = road.count[owner] == 1  # stop signs
     heading[lone] = headings_of_nearest_lanes(road, middle[lone])
     local = rotate(points - middle[:, None], -heading[:, None])
     state = torch.zeros(len(road.kind), dtype=torch.int64)
