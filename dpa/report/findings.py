@@ -16,7 +16,7 @@ FEW_SEEDS = 5
 """With fewer training runs a bootstrap interval is too narrow; see :func:`dpa.report.statistics.paired_bootstrap`."""
 
 
-SAYS = {"better": "better", "worse": "worse", "open": "not told apart"}
+SAYS = {"better": "better", "worse": "Worse", "open": "Not told apart"}
 """Verdicts in words."""
 
 
@@ -112,7 +112,7 @@ def budgets(experiment: Experiment) -> str | None:
         >>> budget = {"dpa_omf": {"steps": 60, "rollouts": 960}, "round 2": {"steps": 120, "rollouts": 1920}}
         >>> labels = {"dpa_omf": "DPA-OMF", "round 2": "round 2"}
         >>> budgets(types.SimpleNamespace(budget=budget, labels=labels, versus="dpa_omf"))
-        'Budgets differ. Over that of DPA-OMF, round 2: 2 times the steps, 2 times the rollouts.'
+        'Budgets differ. Against that of DPA-OMF, 2 times the steps, 2 times the rollouts: round 2.'
     """
     base = experiment.versus.partition("@")[0]
     if base not in experiment.budget:
@@ -126,8 +126,8 @@ def budgets(experiment: Experiment) -> str | None:
             alike.setdefault(", ".join(told), []).append(experiment.labels[method])
     if not alike:
         return None
-    each = "; ".join(f"{', '.join(labels)}: {told}" for told, labels in alike.items())
-    return f"Budgets differ. Over that of {experiment.labels[base]}, {each}."
+    each = ". ".join(f"{told}: {'; '.join(labels)}" for told, labels in alike.items())
+    return f"Budgets differ. Against that of {experiment.labels[base]}, {each}."
 
 
 def saturated(experiment: Experiment, folder: Path) -> str | None:
@@ -167,10 +167,11 @@ def _has_saturated(run: Path) -> bool:
 
 def ordering(experiment: Experiment) -> str:
     """Which methods can be told apart from ``experiment.versus``, each at its own best decoding."""
-    sides: dict[str, list[str]] = {"better": [], "worse": [], "not told apart": []}
+    sides: dict[str, list[str]] = {"better": [], "Worse": [], "Not told apart": []}
     for entry in experiment.own_best.versus:
         sides[SAYS[verdict(entry["ci95"], entry["over"])]].append(experiment.labels[entry["method"]])
-    return "; ".join(f"{side}: {', '.join(labels)}" for side, labels in sides.items() if labels)
+    told = ". ".join(f"{side}: {'; '.join(labels)}" for side, labels in sides.items() if labels)
+    return told[:1].lower() + told[1:]
 
 
 def _decoding(experiment: Experiment, entry: Mapping[str, Any]) -> list[str]:

@@ -122,10 +122,10 @@ def test_methods_are_sorted_by_what_can_be_told_of_them_against_the_headlines(fo
     ends = {"dpa_adef": [-0.01, 0.01], "adversarial_afd": [0.01, 0.02]}
     versus = [{**entry, "ci95": ends[entry["method"]]} for entry in found.own_best.versus]
     own = dataclasses.replace(found.own_best, versus=versus)
-    assert ordering(dataclasses.replace(found, own_best=own)) == "better: adversarial AFD; not told apart: DPA-ADEF"
+    assert ordering(dataclasses.replace(found, own_best=own)) == "better: adversarial AFD. Not told apart: DPA-ADEF"
     once = dataclasses.replace(own, versus=[{**entry, "over": "scenes"} for entry in versus])
     told = ordering(dataclasses.replace(found, own_best=once))
-    assert told == "not told apart: DPA-ADEF, adversarial AFD", "one training run says nothing about a method"
+    assert told == "not told apart: DPA-ADEF; adversarial AFD", "one training run says nothing about a method"
 
 
 @pytest.mark.parametrize(("over", "kind"), [("seeds and scenes", "better"), ("scenes", "open")])
@@ -142,7 +142,7 @@ def test_equal_budgets_are_not_spoken_of_and_others_are_grouped(found: Experimen
     budget = {**found.budget, "dpa_adef": {"steps": 60, "rollouts": 480, "start": "reference"}}
     budget["adversarial_afd"] = budget["dpa_adef"]
     assert budgets(dataclasses.replace(found, budget=budget)) == (
-        "Budgets differ. Over that of DPA-OMF, DPA-ADEF, adversarial AFD: 0.5 times the rollouts."
+        "Budgets differ. Against that of DPA-OMF, 0.5 times the rollouts: DPA-ADEF; adversarial AFD."
     )
 
 

@@ -159,7 +159,7 @@ def test_methods_are_compared_with_the_headlines_in_a_column_and_a_forest(page: 
     low, high = figures(page, "difference in realism to DPA-OMF")[0]["layout"]["xaxis"]["range"]
     assert low < 0 < high, "0 is in sight, though all are worse"
     assert "against DPA-OMF at top-p 0.85" in forest["hovertext"][0] and "by seed: " in forest["hovertext"][0]
-    assert "Against DPA-OMF, worse: DPA-ADEF, adversarial AFD." in page.text
+    assert "Against DPA-OMF, worse: DPA-ADEF; adversarial AFD." in page.text
 
 
 def test_safety_is_paired_scene_by_scene_where_all_have_a_value(page: Page) -> None:
@@ -470,7 +470,7 @@ def test_methods_that_train_on_more_are_named(copied: Path, tmp_path: Path) -> N
     budget["dpa_adef"] |= {"steps": 120, "rollouts": 1920}
     change(copied, "methods", budget=budget)
     page = Page(report(copied, tmp_path / "out").read_text(encoding="utf-8"))
-    told = "Budgets differ. Over that of DPA-OMF, DPA-ADEF: 2 times the steps, 2 times the rollouts."
+    told = "Budgets differ. Against that of DPA-OMF, 2 times the steps, 2 times the rollouts: DPA-ADEF."
     assert page.text.count(told) == 2  # at the top, and beside the tables
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,6 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dpa.safety import MEASURES, Motion, safety
+from dpa.safety.__main__ import main
 from dpa.safety.close_pass import close_pass
 from dpa.safety.wrong_way import drives_against
 from envs.geometry.frames import rotate
@@ -278,6 +281,22 @@ def test_trajectories_that_do_not_fit_are_refused() -> None:
         safety(scene, log.repeat(1, 1, 2, 1), everybody)
     with pytest.raises(ValueError, match=r"controlled is \[2\] bool, got \[3\] torch.bool"):
         safety(scene, log, torch.ones(3, dtype=torch.bool))
+
+
+# --- of a store -----------------------------------------------------------------------------------------------------
+def test_the_logs_of_a_store_tell_by_class_who_leaves_the_road(
+    tmp_path: Path, write_store: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    poses = torch.zeros(4, 91, 3)
+    poses[:, :, 0] = TIME
+    poses[:, :, 1] = torch.tensor([0.0, 45.0, 60.0, 70.0])[:, None]  # the road ends at 50
+    kinds = [AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.PEDESTRIAN, AgentKind.PEDESTRIAN]
+    folder = write_store(tmp_path / "store", [build_scene(poses, EDGE, kind=torch.tensor(kinds))])
+    main([str(folder)])
+    told = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["off-road,", "vehicle", "0.0000", "of", "1", "agents"] in told
+    assert ["off-road,", "pedestrian", "0.6667", "of", "3", "agents"] in told
+    assert not any("cyclist" in line for line in told)
 
 
 if __name__ == "__main__":
