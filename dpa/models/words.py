@@ -1,6 +1,6 @@
 """Tokens of a vocabulary at both ends of a policy: what is made of the last one, and the logits of the next.
 
-Where a token means another motion for each class of agent (:attr:`~dpa.tokens.base.MotionTokenizer.meanings`), each
+Where a token means another motion for each class of agent (:attr:`~dpa.tokens.base.MotionTokenizer.by_class`), each
 class has rows of its own.
 """
 
@@ -9,6 +9,21 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from dpa.tokens.base import MotionTokenizer
+from envs.scene import AgentKind
+
+CLASSES = (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST)
+"""Classes with rows of their own; all others have those of vehicles, whose motions they have as well."""
+
+
+def class_of(kind: Tensor) -> Tensor:
+    """Index into :data:`CLASSES`.
+
+    Examples:
+        >>> import torch
+        >>> class_of(torch.tensor([0, 1, 2, 3, 4])).tolist()
+        [0, 0, 1, 2, 0]
+    """
+    return sum((kind == each) * index for index, each in enumerate(CLASSES))
 
 
 class TokenEmbedding(nn.Embedding):
@@ -26,12 +41,12 @@ class TokenEmbedding(nn.Embedding):
     """
 
     def __init__(self, tokenizer: MotionTokenizer, width: int) -> None:
-        self.meanings, self.words = tokenizer.meanings, tokenizer.vocab_size + 1
-        super().__init__(self.meanings * self.words, width)
+        self.by_class, self.words = tokenizer.by_class, tokenizer.vocab_size + 1
+        super().__init__(self.words * (len(CLASSES) if self.by_class else 1), width)
 
     def forward(self, token: Tensor, kind: Tensor) -> Tensor:
         """``[*, width]`` of tokens ``[*]`` of agents of a class ``[*]``."""
-        return super().forward(token if self.meanings == 1 else kind * self.words + token)
+        return super().forward(class_of(kind) * self.words + token if self.by_class else token)
 
 
 class TokenHead(nn.Linear):
@@ -49,14 +64,14 @@ class TokenHead(nn.Linear):
     """
 
     def __init__(self, width: int, tokenizer: MotionTokenizer) -> None:
-        self.meanings = tokenizer.meanings
-        super().__init__(width, self.meanings * tokenizer.vocab_size)
+        self.by_class = tokenizer.by_class
+        super().__init__(width, tokenizer.vocab_size * (len(CLASSES) if self.by_class else 1))
 
     def forward(self, x: Tensor, kind: Tensor) -> Tensor:
         """``[*, V]`` of nodes ``[*, width]`` of agents of a class ``[*]``."""
         logits = super().forward(x)
-        if self.meanings == 1:
+        if not self.by_class:
             return logits
-        logits = logits.unflatten(-1, (self.meanings, -1))
-        own = kind[..., None, None].expand(*kind.shape, 1, logits.shape[-1])
+        logits = logits.unflatten(-1, (len(CLASSES), -1))
+        own = class_of(kind)[..., None, None].expand(*kind.shape, 1, logits.shape[-1])
         return logits.gather(-2, own).squeeze(-2)

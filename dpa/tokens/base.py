@@ -43,13 +43,13 @@ class MotionTokenizer(nn.Module):
         vocab_size: V; 0 where there is no vocabulary.
         steps: F, poses of 0.1 s in one token.
         shape: of one token, ``()`` for an index.
-        meanings: of one token: 1, or one for each class of agent.
+        by_class: a token is another motion for each class of agent, whatever the agent did before.
     """
 
     vocab_size: int
     steps: int
     shape: tuple[int, ...] = ()
-    meanings: int = 1
+    by_class: bool = False
 
     @property
     def dtype(self) -> torch.dtype:

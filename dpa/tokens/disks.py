@@ -45,7 +45,7 @@ class KDisksTokenizer(MotionTokenizer):
         tensor([0])
     """
 
-    meanings = len(AgentKind)
+    by_class = True
 
     def __init__(self, steps: int, size: int, digest: str) -> None:
         super().__init__()

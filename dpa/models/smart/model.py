@@ -23,7 +23,7 @@ SIZES: dict[str, FactorisedConfig] = {
     "102m": FactorisedConfig(width=456, heads=8, map_layers=4, agent_layers=8, frequencies=64, map_pieces=32,
                              agent_pieces=64, agents=32),
 }  # fmt: skip
-"""Named sizes; parameters are those published, within 10 %, with a vocabulary of 2,048."""
+"""Named sizes; parameters are those published, within 10 %, with motions of 1,024 for each of three classes."""
 
 
 class SMART(FactorisedModel):
@@ -53,7 +53,9 @@ class SMART(FactorisedModel):
     ) -> None:
         super().__init__(named_size(config, SIZES), check_vocabulary(tokenizer, "SMART"), context)
         width = self.config.width
-        self.token, self.kind = quiet(TokenEmbedding(tokenizer, width)), quiet(nn.Embedding(len(AgentKind), width))
+        self.kind = quiet(nn.Embedding(len(AgentKind), width))
+        # A token that is a motion is where it led; one that changes a velocity says more.
+        self.token = None if tokenizer.by_class else quiet(TokenEmbedding(tokenizer, width))
         self.motion = mlp(7, width)
         self.said = nn.Sequential(nn.Linear(width, width), nn.ReLU())
         self.head = TokenHead(width, tokenizer)
@@ -63,7 +65,8 @@ class SMART(FactorisedModel):
         moved = to_local(recent[:, :, 0], recent[:, :, -1])  # where it was, from where it is
         length, turned = moved[..., :2].norm(dim=-1, keepdim=True), moved[..., 2:]
         motion = self.motion(torch.cat((moved[..., :2] / METRES, length / METRES, turned, extent / METRES), -1))
-        return motion + self.token(token, kind) + self.kind(kind)
+        known = motion + self.kind(kind)
+        return known if self.token is None else known + self.token(token, kind)
 
     def decide(self, x: Tensor, recent: Tensor, kind: Tensor) -> Tensor:
         """See :meth:`~dpa.models.factorised.FactorisedModel.decide`: logits of all tokens."""
