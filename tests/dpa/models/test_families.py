@@ -120,7 +120,7 @@ def test_where_a_scene_lies_changes_nothing(family: str, motion: tuple, scene: C
     tokens = tokens_for(model, 3)
     here, there = scene(3), move(scene(3), torch.tensor(motion))
     mine, other = (logits_of(model, make_context(each, model.featurize), tokens) for each in (here, there))
-    torch.testing.assert_close(other, mine, atol=2e-3, rtol=0)
+    torch.testing.assert_close(other, mine, atol=2e-4, rtol=0)
 
 
 @families_of_tokens
@@ -174,15 +174,16 @@ SEEN_AT_ONCE = {"behaviorgpt": nobody, "motionlm": nobody, "smart": nobody, "tra
 
 
 @families
-def test_a_token_is_seen_by_those_who_decide_after_it(family: str, scene: Callable) -> None:
+@pytest.mark.parametrize("decision", [0, 6, 15])
+def test_a_token_is_seen_by_those_who_decide_after_it(family: str, decision: int, scene: Callable) -> None:
     model = make(family)
     tokens = tokens_for(model, 4)
     context, other = make_context(scene(4, leave=False), model.featurize), tokens.clone()
-    other[:, :, 1, 6] = 13 * 12 if model.tokenizer.vocab_size else tokens[:, :, 1, 6] / 2
+    other[:, :, 1, decision] = 13 * 12 if model.tokenizer.vocab_size else tokens[:, :, 1, decision] / 2
     changed = (logits_of(model, context, tokens) != logits_of(model, context, other)).any(-1)
-    assert not changed[..., :6].any()
-    assert torch.equal(changed[..., 6], SEEN_AT_ONCE[family](context, 1).expand(1, 2, 4))
-    assert changed[..., 1, 7:].all() and changed[..., 7:].any()
+    assert not changed[..., :decision].any()
+    assert torch.equal(changed[..., decision], SEEN_AT_ONCE[family](context, 1).expand(1, 2, 4))
+    assert changed[..., decision + 1 :].all(), "everybody is near"
 
 
 @families
@@ -195,9 +196,10 @@ def test_padding_and_the_order_of_agents_change_nothing(family: str, scene: Call
         valid = torch.ones(2, 1, 6, 16, dtype=torch.bool)
         both = model(collate_contexts([small, large]), tokens.expand(2, *tokens.shape[1:]), valid)
     torch.testing.assert_close(both[:1, :, :2], alone, atol=1e-5, rtol=0)
-    order = torch.tensor([3, 0, 5, 1, 4, 2])
+    whole, order = logits_of(model, large, tokens), torch.tensor([3, 0, 5, 1, 4, 2])
+    torch.testing.assert_close(both[1:], whole, atol=1e-5, rtol=0)
     shuffled = logits_of(model, keep_agents(large, order), tokens[:, :, order])
-    torch.testing.assert_close(shuffled, logits_of(model, large, tokens)[:, :, order], atol=1e-5, rtol=0)
+    torch.testing.assert_close(shuffled, whole[:, :, order], atol=1e-5, rtol=0)
 
 
 @families
