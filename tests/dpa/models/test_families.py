@@ -239,23 +239,26 @@ def test_rows_that_begin_again_have_no_past(family: str, scene: Callable) -> Non
 @families
 def test_rows_may_stand_at_different_decisions_of_scenes_of_different_size(family: str, scene: Callable) -> None:
     model, scenes = make(family), [scene(4, seed=1), scene(2, seed=2), scene(6, seed=3)]
-    env = TrafficEnv(scenes, num_scenes=2, num_rollouts=2, num_agents=6)
+    episode = EpisodeOptions(max_controlled=3)
+    env = TrafficEnv(scenes, episode, num_scenes=2, num_rollouts=2, num_agents=6)
     env = TransformedEnv(env, TokenAction(model.tokenizer))
-    actor = MotionActor(model, Contexts(scenes, model.featurize), num_rollouts=2)
+    actor = MotionActor(model, Contexts(scenes, model.featurize, episode), num_rollouts=2)
     state, steps = env.reset(), []
-    # At 3 a row starts again; a group moves on at 6, from two agents to six, and at 9, to four.
-    resets = {3: [True, False, False, False], 6: [False, False, True, True], 9: [False, False, True, True]}
-    for step in range(12):
+    # At 3 a row starts again; a group moves on at 6, from two agents to six, and at 9, to four; at 12 both do.
+    alone, second, both = [True, False, False, False], [False, False, True, True], [True] * 4
+    resets = {3: alone, 6: second, 9: second, 12: both}
+    for step in range(15):
         if step in resets:
             state = env.reset(state.set("_reset", torch.tensor(resets[step])[:, None])).exclude("_reset")
         steps.append(env.step(actor(state)))
         state = steps[-1]["next"].exclude("reward", keys.REWARD)
     rolled = torch.stack(steps, 1)
-    assert rolled[keys.SCENE][2:, ::3].tolist() == [[1, 1, 2, 0]] * 2
-    for row, first, last in ((0, 0, 3), (0, 3, 12), (1, 0, 12), (2, 0, 6), (2, 6, 9), (3, 9, 12)):
+    assert rolled[keys.SCENE][2:, ::3].tolist() == [[1, 1, 2, 0, 2]] * 2
+    spans = ((0, 0, 3), (0, 3, 12), (1, 0, 12), (2, 0, 6), (2, 6, 9), (3, 9, 12), (1, 12, 15), (2, 12, 15))
+    for row, first, last in spans:
         part = rolled[row : row + 1, first:last]
         played, controlled = [scenes[int(part[keys.SCENE][0, 0])]], part[keys.CONTROLLED].transpose(1, 2)
-        expected = forced(model, played, EpisodeOptions(), part)
+        expected = forced(model, played, episode, part)
         written = part[keys.LOG_PROB].transpose(1, 2)
         torch.testing.assert_close(written[controlled], expected[controlled], atol=1e-5, rtol=0)
 
