@@ -53,6 +53,8 @@ def forced(model: MotionModel, scenes: list[Scene], episode: EpisodeOptions, rol
     contexts = collate_contexts([make_context(scene, model.featurize, episode) for scene in scenes])
     tokens = rolled[keys.TOKEN].transpose(1, 2).unflatten(0, (len(scenes), -1))
     context = pad_context(contexts, tokens.shape[2])
+    for mine, key in ((context.episode.controlled, keys.CONTROLLED), (context.episode.valid, keys.VALID)):
+        assert torch.equal(mine.repeat_interleave(tokens.shape[1], 0), rolled[key][:, 0]), "the same agents"
     valid = context.episode.controlled[:, None, :, None].expand(-1, 1, -1, tokens.shape[3])
     return model.distribution.log_prob(model(context, tokens, valid), tokens).flatten(0, 1)
 
@@ -60,27 +62,32 @@ def forced(model: MotionModel, scenes: list[Scene], episode: EpisodeOptions, rol
 OPTIONS = {
     "plain": EpisodeOptions(),
     "two controlled": EpisodeOptions(max_controlled=2),
-    "arrivals": EpisodeOptions(arrivals=True, max_controlled=3),
+    "arrivals": EpisodeOptions(arrivals=True),
+    "arrivals, two controlled": EpisodeOptions(arrivals=True, max_controlled=2),
+    "only the SDC": EpisodeOptions(control="sdc"),
+    "predicted agents, and arrivals": EpisodeOptions(control="predict", arrivals=True),
+    "a mask, and arrivals": EpisodeOptions(control=lambda scene: scene.agents.track_id % 2 == 1, arrivals=True),
     "short": EpisodeOptions(horizon=5),
 }
 
 
 @families
 @pytest.mark.parametrize("episode", OPTIONS.values(), ids=OPTIONS)
-def test_decision_by_decision_is_as_in_one_pass(family: str, episode: EpisodeOptions, scene: Callable) -> None:
-    model, scenes = make(family), [scene(4, seed=1), scene(6, seed=2)]
-    rolled = drive(model, scenes, episode, rollouts=3)
+def test_decision_by_decision_is_as_in_one_pass(family: str, episode: EpisodeOptions, arriving: list[Scene]) -> None:
+    model = make(family)
+    rolled = drive(model, arriving, episode)
     written, controlled = (rolled[key].transpose(1, 2) for key in (keys.LOG_PROB, keys.CONTROLLED))
-    expected = forced(model, scenes, episode, rolled)
+    assert controlled[..., 0].any(-1).all()
+    expected = forced(model, arriving, episode, rolled)
     assert_as_near(model, written[controlled], expected[controlled])
     assert written[controlled].std() > 0.1, "tokens differ in how likely they are"
 
 
 @families
 @pytest.mark.parametrize("steps", [2, 4, 10])
-def test_decisions_of_any_length_are_as_in_one_pass(family: str, steps: int, scene: Callable) -> None:
-    episode = EpisodeOptions(decision_steps=steps, horizon=min(80 // steps, 12))
-    model, scenes = make(family, tokens_of(family, steps), episode.horizon), [scene(3, seed=1)]
+def test_decisions_of_any_length_are_as_in_one_pass(family: str, steps: int, arriving: list[Scene]) -> None:
+    episode = EpisodeOptions(decision_steps=steps, horizon=min(80 // steps, 12), arrivals=True)
+    model, scenes = make(family, tokens_of(family, steps), episode.horizon), arriving[:1]
     rolled = drive(model, scenes, episode)
     written, controlled = (rolled[key].transpose(1, 2) for key in (keys.LOG_PROB, keys.CONTROLLED))
     expected = forced(model, scenes, episode, rolled)
