@@ -23,6 +23,8 @@ from envs.files import write_bytes
 Backend = Literal["csv", "wandb", "tensorboard"]
 MODULES = {"wandb": "wandb", "tensorboard": "tensorboard"}
 """The package that each further backend needs."""
+PROJECT = "dpa-omf"
+"""Where runs are in Weights & Biases."""
 
 
 class MetricLogger(Protocol):
@@ -71,7 +73,6 @@ def make_logger(
     config: Mapping[str, Any],
     *,
     resume_step: int | None = None,
-    project: str = "dpa-omf",
     name: str | None = None,
     mode: Literal["online", "offline"] = "offline",
 ) -> MetricLogger:
@@ -85,8 +86,7 @@ def make_logger(
         config: the run's configuration, plain dicts, lists, numbers and strings.
         resume_step: the step of the checkpoint that the run goes on from: what is of later steps is dropped. ``None``
             for a new run, which drops all of an earlier run in the folder.
-        project: project of Weights & Biases.
-        name: name of the run there; the folder's name by default.
+        name: of the run in Weights & Biases; the folder's name by default.
         mode: of Weights & Biases; ``"offline"`` keeps the run in ``folder`` and sends nothing.
 
     Raises:
@@ -109,7 +109,7 @@ def make_logger(
     folder = Path(folder)
     files = CsvLogger(folder, config, resume_step)
     if backend == "wandb":
-        return _Tee(files, _WandbLogger(folder, config, resume_step, project, name or folder.name, mode))
+        return _Tee(files, _WandbLogger(folder, config, resume_step, name or folder.name, mode))
     if backend == "tensorboard":
         return _Tee(files, _TensorboardLogger(folder, resume_step))
     return files
@@ -209,9 +209,7 @@ class CsvLogger:
 class _WandbLogger:
     """Weights & Biases. The run's id is kept in the folder, so a resumed run goes on in the same run."""
 
-    def __init__(
-        self, folder: Path, config: Mapping[str, Any], resume_step: int | None, project: str, name: str, mode: str
-    ) -> None:
+    def __init__(self, folder: Path, config: Mapping[str, Any], resume_step: int | None, name: str, mode: str) -> None:
         import wandb
 
         id_file = folder / "wandb_id.txt"
@@ -219,7 +217,7 @@ class _WandbLogger:
             write_bytes(id_file, f"{secrets.token_hex(4)}\n".encode())
         run_id = id_file.read_text().strip()
         self._run = wandb.init(
-            project=project, name=name, id=run_id, resume="allow", dir=folder, config=dict(config), mode=mode
+            project=PROJECT, name=name, id=run_id, resume="allow", dir=folder, config=dict(config), mode=mode
         )
         # Its own step counter cannot go back to the step of a checkpoint, so our step is a metric of its own.
         self._run.define_metric("step")
