@@ -26,6 +26,9 @@ MODULES = {"wandb": "wandb", "tensorboard": "tensorboard"}
 PROJECT = "dpa-omf"
 """Where runs are in Weights & Biases."""
 
+Curve = list[tuple[int, float]]
+"""Rows ``(step, value)``."""
+
 
 class MetricLogger:
     """Where a run's numbers, tables and pictures go: to every backend, checked once.
@@ -144,19 +147,29 @@ def check_backend(backend: str) -> None:
         )
 
 
-def read_curve(folder: str | os.PathLike[str], metric: str) -> list[tuple[int, float]]:
-    """The rows ``(step, value)`` of one metric in a run's folder, as written.
+def read_curve(folder: str | os.PathLike[str], metric: str) -> Curve:
+    """One of :func:`read_curves`.
+
+    Raises:
+        FileNotFoundError: the run has no such metric; the message lists those it has.
+        ValueError: see :func:`read_curves`.
+    """
+    path = _curve_path(Path(folder), metric)
+    if not path.is_file():
+        known = ", ".join(_curves(Path(folder))) or "none"
+        raise FileNotFoundError(f"{folder} has no curve {metric!r}; it has {known}.")
+    return _rows(path)
+
+
+def read_curves(folder: str | os.PathLike[str]) -> dict[str, Curve]:
+    """All curves in a run's folder by metric, in order of name, as written; torchrl's ``CSVLogger`` writes the same.
 
     A last row that was cut short by a crash is left out.
 
     Raises:
-        FileNotFoundError: the run has no such metric; the message lists those it has.
+        ValueError: a row that is not ``step,value``; the message names file and line.
     """
-    path = _curve_path(Path(folder), metric)
-    if not path.is_file():
-        known = sorted(str(p.relative_to(path.parents[metric.count("/")]))[:-4] for p in _curves(Path(folder)))
-        raise FileNotFoundError(f"{folder} has no curve {metric!r}; it has {', '.join(known) or 'none'}.")
-    return [(int(step), float(value)) for step, value in complete_rows(path)]
+    return {metric: _rows(path) for metric, path in _curves(Path(folder)).items()}
 
 
 class _Files:
@@ -166,7 +179,7 @@ class _Files:
         text = json.dumps(config, indent=2, sort_keys=True)
         folder.mkdir(parents=True, exist_ok=True)
         write_bytes(folder / "config.json", f"{text}\n".encode())
-        for path in _curves(folder):
+        for path in _curves(folder).values():
             _drop_rows_after(path, resume_step)
         for path in _exhibits(folder) if resume_step is None else ():
             path.unlink()
@@ -273,8 +286,9 @@ def _curve_path(folder: Path, metric: str) -> Path:
     return folder / "scalars" / f"{metric}.csv"
 
 
-def _curves(folder: Path) -> list[Path]:
-    return sorted((folder / "scalars").rglob("*.csv"))
+def _curves(folder: Path) -> dict[str, Path]:
+    scalars = folder / "scalars"
+    return {path.relative_to(scalars).as_posix()[:-4]: path for path in sorted(scalars.rglob("*.csv"))}
 
 
 def _exhibits(folder: Path) -> list[Path]:
@@ -282,7 +296,18 @@ def _exhibits(folder: Path) -> list[Path]:
     return sorted(path for path in found if path.is_file() and path.stem.isdigit())
 
 
-def complete_rows(path: Path) -> list[list[str]]:
+def _rows(path: Path) -> Curve:
+    rows = []
+    for line, row in enumerate(_complete_rows(path), start=1):
+        try:
+            step, value = row
+            rows.append((int(step), float(value)))
+        except ValueError as error:
+            raise ValueError(f"{path}:{line}: expected 'step,value', got {','.join(row)!r}.") from error
+    return rows
+
+
+def _complete_rows(path: Path) -> list[list[str]]:
     """Rows of a curve's file, without a last one that a kill cut short."""
     lines = path.read_text().splitlines(keepends=True)
     return [line.strip().split(",") for line in lines if line.endswith("\n")]
@@ -290,7 +315,7 @@ def complete_rows(path: Path) -> list[list[str]]:
 
 def _drop_rows_after(path: Path, step: int | None) -> None:
     try:
-        rows = [] if step is None else [row for row in complete_rows(path) if int(row[0]) <= step]
+        rows = [] if step is None else [row for row in _complete_rows(path) if int(row[0]) <= step]
     except ValueError as error:
         raise ValueError(f"{path} is no curve ({error}); remove it and run again.") from None
     if rows:

@@ -14,7 +14,7 @@ import pytest
 import torch
 from PIL import Image
 
-from dpa.training.loggers import make_logger, read_curve
+from dpa.training.loggers import make_logger, read_curve, read_curves
 from tests.dpa.training.offline import wandb_history
 
 HEADER = ["method", "realism", "scenes"]
@@ -44,6 +44,7 @@ def test_the_layout_is_that_of_torchrl(tmp_path: Path) -> None:
     write(tmp_path / "ours", range(2))
     curve = Path("scalars", "train", "loss.csv")
     assert (tmp_path / "ours" / curve).read_text() == (tmp_path / "theirs" / curve).read_text()
+    assert read_curves(tmp_path / "theirs") == {"train/loss": [(0, 0.0), (1, 0.5)]}
 
 
 def test_a_resumed_run_has_every_step_once(tmp_path: Path) -> None:
@@ -65,6 +66,17 @@ def test_a_new_run_in_an_old_folder_starts_with_empty_curves(tmp_path: Path) -> 
     write(tmp_path, range(6))
     write(tmp_path, range(1))
     assert read_curve(tmp_path, "train/loss") == [(0, 0.0)]
+
+
+def test_a_broken_row_is_named_with_file_and_line(tmp_path: Path) -> None:
+    (tmp_path / "scalars").mkdir()
+    (tmp_path / "scalars/loss.csv").write_text("0,1.0\n1\n")
+    with pytest.raises(ValueError, match=r"loss\.csv:2: expected 'step,value', got '1'"):
+        read_curves(tmp_path)
+
+
+def test_a_folder_without_curves_has_none(tmp_path: Path) -> None:
+    assert read_curves(tmp_path) == {}
 
 
 def test_an_unknown_curve_is_refused_naming_those_there_are(tmp_path: Path) -> None:
