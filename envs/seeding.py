@@ -31,17 +31,16 @@ def derive_seed(seed: int, *names: str | int) -> int:
     return int.from_bytes(digest, "little") >> 1
 
 
-def make_generator(seed: int, *names: str | int, device: torch.device | str = "cpu") -> torch.Generator:
+def make_generator(seed: int, *names: str | int) -> torch.Generator:
     """A torch generator seeded with :func:`derive_seed`.
 
     Args:
         seed: the run's seed.
         names: what the generator is for.
-        device: where it draws.
 
     Examples:
         >>> shuffle = make_generator(0, "batches")
         >>> torch.randperm(4, generator=shuffle).sort().values.tolist()
         [0, 1, 2, 3]
     """
-    return torch.Generator(device=device).manual_seed(derive_seed(seed, *names))
+    return torch.Generator().manual_seed(derive_seed(seed, *names))

@@ -19,8 +19,8 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from dpa.losses import SaturationWatch
-from dpa.report.curves import read_curves
 from dpa.training.distributed import ALONE, Ranks, join_ranks
+from dpa.training.loggers import read_curves
 from dpa.training.run import Run
 from dpa.training.seeding import seed_everything
 from envs import keys
@@ -174,7 +174,7 @@ def check_preferences(method: DictConfig, preferences: Path | None, expert: Path
 
 def write_result(result: Path, policy: Path, decided_by: dict[str, Any], saturation: SaturationWatch) -> None:
     """Say that a run is finished: what decided it, its last figures, and the warning where its loss saturated."""
-    last = {name: finite(curve["value"][-1]) for name, curve in read_curves(result.parent).items()}
+    last = {name: finite(curve[-1][1]) for name, curve in read_curves(result.parent).items()}
     warned = {} if saturation.found is None else {SATURATED: saturation.found}
     write_json(result, {"options": decided_by, "policy": str(policy), "last_step": last, **warned})
 

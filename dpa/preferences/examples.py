@@ -25,9 +25,9 @@ def example_provenance(num_rollouts: int = 8) -> Provenance:
     )
 
 
-def example_groups(num_scenes: int, first: int = 0, num_rollouts: int = 8, num_agents: int = 4) -> TensorDict:
-    """Made-up groups of batch size ``[num_scenes]``: scene i has 2 to ``num_agents`` agents, of all classes."""
-    generator = torch.Generator().manual_seed(first)
+def example_groups(num_scenes: int, first: int = 0, num_rollouts: int = 8) -> TensorDict:
+    """Made-up groups of batch size ``[num_scenes]``: scenes have 2 to 4 agents, of all classes."""
+    generator, num_agents = torch.Generator().manual_seed(first), 4
     size = (num_scenes, num_rollouts, num_agents)
     agents = 2 + (first + torch.arange(num_scenes)) % (num_agents - 1)
     there = torch.arange(num_agents) < agents[:, None]

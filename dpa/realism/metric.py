@@ -186,8 +186,6 @@ def realism_of_groups(
     simulated: Tensor,
     groups: Sequence[Tensor],
     config: str | Path | RealismConfig = "2024",
-    *,
-    quirks: bool = True,
 ) -> list[RealismResult]:
     """Score groups of the rollouts of one scene, each as :func:`realism` would; all are measured once.
 
@@ -196,7 +194,6 @@ def realism_of_groups(
         simulated: ``[R, A, 80, 4]``, see :func:`realism`.
         groups: of each group the rollouts, ``[R']`` int64.
         config: see :func:`realism`.
-        quirks: see :func:`realism`.
 
     Raises:
         ValueError: as for :func:`realism`, or a group without rollouts.
@@ -210,7 +207,7 @@ def realism_of_groups(
     """
     if any(len(group) == 0 for group in groups):
         raise ValueError(f"scene {scene.scene_id}: a group without rollouts has no realism; give each at least one.")
-    config, simulated = _opened(config, quirks), simulated.to(scene.agents.position)
+    config, simulated = _opened(config), simulated.to(scene.agents.position)
     _check(scene, simulated, config, None)
     (measured,) = measure([compare(scene, simulated, config)], config)
     return [_score(measured.of(group), config, features=False) for group in groups]
@@ -256,7 +253,7 @@ def contributions(measured: Features, config: RealismConfig) -> Tensor:
     return added
 
 
-def _opened(config: str | Path | RealismConfig, quirks: bool) -> RealismConfig:
+def _opened(config: str | Path | RealismConfig, quirks: bool = True) -> RealismConfig:
     opened = config if isinstance(config, RealismConfig) else RealismConfig.load(config)
     return opened if quirks else opened.replace(quirks=frozenset())
 

@@ -266,7 +266,7 @@ def _trace(line: Line) -> dict[str, Any]:
     return trace
 
 
-def bars(values: Mapping[str, float], title: str, *, x: str, hover: Sequence[str], caption: str = "") -> Chart:
+def bars(values: Mapping[str, float], title: str, *, x: str, hover: Sequence[str]) -> Chart:
     """Lying bars, the first on top."""
     figure = go.Figure(
         go.Bar(
@@ -280,7 +280,7 @@ def bars(values: Mapping[str, float], title: str, *, x: str, hover: Sequence[str
         yaxis={"autorange": "reversed", "automargin": True, "fixedrange": True, "showgrid": False},
         bargap=0.45,
     )
-    return Chart(figure, title, caption, 80 + 28 * max(len(values), 2))
+    return Chart(figure, title, "", 80 + 28 * max(len(values), 2))
 
 
 def heat(

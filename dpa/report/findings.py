@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from dpa.losses.saturation import WATCHED, SaturationWatch
-from dpa.report.curves import read_curves
 from dpa.report.experiment import Decoding, Experiment, decoding_of, in_words, read_json
 from dpa.report.statistics import SCENES, verdict
 from dpa.report.table import REFERENCE, signed
+from dpa.training.loggers import read_curves
 
 FEW_SEEDS = 5
 """With fewer training runs a bootstrap interval is too narrow; see :func:`dpa.report.statistics.paired_bootstrap`."""
@@ -156,12 +156,12 @@ def _has_saturated(run: Path) -> bool:
     """Whether the loss of a finished run saturated: by its curves; by the warning in its result where it lacks them."""
     result = read_json(run / "result.json")
     loss = result.get("options", {}).get("loss")
-    curves = read_curves(run) if (run / "scalars").is_dir() else {}
+    curves = read_curves(run)
     if loss is None or any(f"train/{name}" not in curves for name in WATCHED):
         return "saturated" in result
     watch, seen = SaturationWatch(loss), [curves[f"train/{name}"] for name in WATCHED]
-    for done, *figures in zip(seen[0]["step"], *(curve["value"] for curve in seen), strict=True):
-        watch(int(done) - 1, dict(zip(WATCHED, figures, strict=True)))
+    for rows in zip(*seen, strict=True):
+        watch(rows[0][0] - 1, {name: value for name, (_, value) in zip(WATCHED, rows, strict=True)})
     return watch.found is not None
 
 

@@ -27,19 +27,17 @@ from dpa.report.sections.results import experiment_section
 from dpa.report.study import Evaluations, Study
 from envs.files import write_bytes
 
+TITLE = "Preference alignment"
 SHOWS = {"validity": validity_section, "sensitivity": sensitivity_section, "discriminator": discriminator_section}
 
 
-def write_study(
-    path: str | Path, study: Study, *, experiments: Iterable[str] = (), title: str = "Preference alignment"
-) -> Path:
+def write_study(path: str | Path, study: Study, *, experiments: Iterable[str] = ()) -> Path:
     """Write the page of a study; it appears whole or not at all.
 
     Args:
         path: of the page, ``.html``.
         study: see :func:`dpa.report.study.read_study`.
         experiments: names of all experiments there are; those that the study lacks are named on the page.
-        title: of the page.
 
     Returns:
         Path of the page.
@@ -55,14 +53,14 @@ def write_study(
     ]
     body = joined(
         [
-            element("header", element("h1", title), claim(study)),
+            element("header", element("h1", TITLE), claim(study)),
             element("nav", *index, aria_label="Contents"),
             element("main", *shown),
             Html(f"<script>{get_plotlyjs()}</script>"),
             Html(f"<script>{resource('report.js')}</script>"),
         ]
     )
-    return _write(Path(path), title, body, style=resource("report.css"))
+    return _write(Path(path), TITLE, body, style=resource("report.css"))
 
 
 def write_rollouts(

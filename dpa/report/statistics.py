@@ -101,13 +101,11 @@ def paired_bootstrap(
     return _bootstrap(mine - other, num_resamples, seed)
 
 
-def summary(values: ArrayLike, num_resamples: int = 10_000, *, seed: int = 0) -> Interval:
+def summary(values: ArrayLike) -> Interval:
     """Mean of one method and its interval, resampled like :func:`paired_bootstrap`.
 
     Args:
         values: ``[seeds, scenes]``.
-        num_resamples: bootstrap draws.
-        seed: of the draws.
 
     Raises:
         ValueError: no scene, or a value that is not finite.
@@ -116,7 +114,7 @@ def summary(values: ArrayLike, num_resamples: int = 10_000, *, seed: int = 0) ->
         >>> summary([[1.0, 1.0], [1.0, 1.0]])
         Interval(mean=1.0, low=1.0, high=1.0, over='seeds and scenes', num_seeds=2, num_scenes=2)
     """
-    return _bootstrap(_checked(values, "values"), num_resamples, seed)
+    return _bootstrap(_checked(values, "values"))
 
 
 def resampled_means(values: ArrayLike, num_resamples: int = 10_000, *, seed: int = 0) -> NDArray[np.float64]:
@@ -155,8 +153,6 @@ def compare_methods(
     per_scene: Mapping[str, Mapping[str, Sequence[float]]],
     reference: str,
     num_resamples: int = 10_000,
-    *,
-    seed: int = 0,
 ) -> list[dict]:
     """The ``paired`` entries of a comparison: every method against the reference.
 
@@ -165,7 +161,6 @@ def compare_methods(
             order. A method's seeds are paired with the reference's seeds of the same name, or all with its only seed.
         reference: name of the reference method.
         num_resamples: bootstrap draws.
-        seed: of the draws.
 
     Returns:
         ``{"method", "realism_difference", "ci95": [low, high], "over", "n_seeds"}`` for each method, in order.
@@ -192,7 +187,7 @@ def compare_methods(
             )
         paired = [base[run] for run in runs] if len(base) > 1 else list(base.values())
         try:
-            found = paired_bootstrap(_rows(runs.values()), _rows(paired), num_resamples, seed=seed)
+            found = paired_bootstrap(_rows(runs.values()), _rows(paired), num_resamples)
         except ValueError as error:
             raise ValueError(f"{method} against {reference}: {error}") from error
         entries.append(
@@ -227,7 +222,7 @@ def _checked(values: ArrayLike, name: str) -> NDArray[np.float64]:
     return array
 
 
-def _bootstrap(values: NDArray[np.float64], num_resamples: int, seed: int) -> Interval:
+def _bootstrap(values: NDArray[np.float64], num_resamples: int = 10_000, seed: int = 0) -> Interval:
     return interval_of(float(values.mean()), resampled_means(values[None], num_resamples, seed=seed)[0], *values.shape)
 
 

@@ -197,7 +197,6 @@ def print_table(
     paired: Sequence[dict[str, Any]] = (),
     *,
     title: str | None = None,
-    console: Console | None = None,
 ) -> None:
     """Print the table.
 
@@ -205,9 +204,8 @@ def print_table(
         rows: see :func:`summarise`.
         paired: see :func:`summarise`.
         title: above the table.
-        console: where to print; standard output by default.
     """
-    print_whole(to_rich(rows, paired, title=title), console or Console(markup=False))
+    print_whole(to_rich(rows, paired, title=title), Console(markup=False))
 
 
 def print_whole(table: Table, console: Console) -> None:

@@ -79,51 +79,23 @@ def as_markdown(table: Table) -> str:
     return "\n".join(f"| {' | '.join(map(_markdown_cell, line))} |" for line in lines)
 
 
-def as_picture(name: str, source: str | os.PathLike[str] | Any) -> Picture:
-    """Read a picture file, or make one of pixels.
+def read_picture(name: str, path: str | os.PathLike[str]) -> Picture:
+    """Read a picture file, which is kept to the byte.
 
     Args:
         name: of the picture.
-        source: path of a PNG or JPEG file, kept to the byte; or an array or tensor ``[H, W]`` or ``[H, W, 3]``, uint8
-            or floating point from 0 to 1, kept as PNG.
+        path: of a PNG or JPEG file.
 
     Raises:
         ValueError: a name that is no path below a folder, or what is no picture.
-
-    Examples:
-        >>> picture = as_picture("eval/grey", np.full((4, 6), 0.5))
-        >>> picture.suffix, picture.pixels.shape, int(picture.pixels[0, 0, 0])
-        ('png', (4, 6, 3), 128)
     """
     _check_name("picture", name)
-    if isinstance(source, str | os.PathLike):
-        return _from_file(name, Path(source))
-    pixels = _as_pixels(name, source)
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="PNG")
-    return Picture(name, buffer.getvalue(), "png", pixels)
-
-
-def _from_file(name: str, path: Path) -> Picture:
     try:
-        content = path.read_bytes()
+        content = Path(path).read_bytes()
         with Image.open(io.BytesIO(content), formats=list(SUFFIXES)) as image:
             return Picture(name, content, SUFFIXES[image.format], np.asarray(image.convert("RGB")))
     except (OSError, UnidentifiedImageError) as error:
         raise ValueError(f"picture {name!r}: {path} is no PNG or JPEG file that can be read ({error}).") from None
-
-
-def _as_pixels(name: str, source: Any) -> np.ndarray:
-    source = source.detach().cpu().numpy() if hasattr(source, "detach") else np.asarray(source)
-    if source.ndim not in (2, 3) or source.shape[2:] not in ((), (3,)) or not source.size:
-        raise ValueError(f"picture {name!r} must be [H, W] or [H, W, 3], got the shape {list(source.shape)}.")
-    if np.issubdtype(source.dtype, np.floating):
-        if not ((source >= 0) & (source <= 1)).all():
-            raise ValueError(f"picture {name!r} is floating point and must be from 0 to 1; scale it, or give uint8.")
-        source = np.rint(source * 255).astype(np.uint8)
-    if source.dtype != np.uint8:
-        raise ValueError(f"picture {name!r} must be uint8, or floating point from 0 to 1, got {source.dtype}.")
-    return np.repeat(source[..., None], 3, -1) if source.ndim == 2 else source
 
 
 def _check_name(kind: str, name: str) -> None:

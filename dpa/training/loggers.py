@@ -15,25 +15,36 @@ import os
 import secrets
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, Protocol, TextIO
+from typing import Any, Literal, TextIO
 
-from dpa.training.exhibits import Picture, Table, as_markdown, as_picture, as_table
+from dpa.training.exhibits import Picture, Table, as_markdown, as_table, read_picture
 from envs.files import write_bytes
 
 Backend = Literal["csv", "wandb", "tensorboard"]
 MODULES = {"wandb": "wandb", "tensorboard": "tensorboard"}
 """The package that each further backend needs."""
+PROJECT = "dpa-omf"
+"""Where runs are in Weights & Biases."""
+
+Curve = list[tuple[int, float]]
+"""Rows ``(step, value)``."""
 
 
-class MetricLogger(Protocol):
-    """Where a run's numbers, tables and pictures go.
+class MetricLogger:
+    """Where a run's numbers, tables and pictures go: to every backend, checked once.
 
-    There is one table, and one picture, for a name and a step. What an earlier run wrote up to the step that this run
-    goes on from stays, and is not written again.
+    Args:
+        backends: files first.
     """
+
+    def __init__(self, *backends: _Files | _Wandb | _Tensorboard) -> None:
+        self._backends = backends
 
     def log(self, metrics: Mapping[str, Any], step: int) -> None:
         """Write numbers or tensors of one element, named ``"<group>/<metric>"``, for one step."""
+        metrics = _as_floats(metrics)
+        for backend in self._backends:
+            backend.log(metrics, step)
 
     def table(self, name: str, header: Sequence[str], rows: Sequence[Sequence[Any]], step: int) -> None:
         """Write a table.
@@ -45,24 +56,31 @@ class MetricLogger(Protocol):
             step: that the table is about.
 
         Raises:
-            ValueError: no table, or this run has written one of this name and step.
+            ValueError: no table.
         """
+        table = as_table(name, header, rows)
+        for backend in self._backends:
+            backend.table(table, step)
 
-    def picture(self, name: str, picture: Any, step: int) -> None:
+    def picture(self, name: str, path: str | os.PathLike[str], step: int) -> None:
         """Write a picture.
 
         Args:
             name: ``"<group>/<picture>"``.
-            picture: path of a PNG or JPEG file; or an array or tensor ``[H, W]`` or ``[H, W, 3]``, uint8 or floating
-                point from 0 to 1.
+            path: of a PNG or JPEG file.
             step: that the picture is about.
 
         Raises:
-            ValueError: no picture, or this run has written one of this name and step.
+            ValueError: no picture.
         """
+        picture = read_picture(name, path)
+        for backend in self._backends:
+            backend.picture(picture, step)
 
     def close(self) -> None:
         """Flush and close; a closed logger is not used again."""
+        for backend in self._backends:
+            backend.close()
 
 
 def make_logger(
@@ -71,7 +89,6 @@ def make_logger(
     config: Mapping[str, Any],
     *,
     resume_step: int | None = None,
-    project: str = "dpa-omf",
     name: str | None = None,
     mode: Literal["online", "offline"] = "offline",
 ) -> MetricLogger:
@@ -83,10 +100,9 @@ def make_logger(
         backend: ``"csv"``, ``"wandb"`` or ``"tensorboard"``.
         folder: the run's folder. ``config.json`` in it records ``config``.
         config: the run's configuration, plain dicts, lists, numbers and strings.
-        resume_step: the step of the checkpoint that the run goes on from: what is of later steps is dropped. ``None``
+        resume_step: the step of the checkpoint that the run goes on from: numbers of later steps are dropped. ``None``
             for a new run, which drops all of an earlier run in the folder.
-        project: project of Weights & Biases.
-        name: name of the run there; the folder's name by default.
+        name: of the run in Weights & Biases; the folder's name by default.
         mode: of Weights & Biases; ``"offline"`` keeps the run in ``folder`` and sends nothing.
 
     Raises:
@@ -107,12 +123,12 @@ def make_logger(
     """
     check_backend(backend)
     folder = Path(folder)
-    files = CsvLogger(folder, config, resume_step)
+    files = _Files(folder, config, resume_step)
     if backend == "wandb":
-        return _Tee(files, _WandbLogger(folder, config, resume_step, project, name or folder.name, mode))
+        return MetricLogger(files, _Wandb(folder, config, resume_step, name or folder.name, mode))
     if backend == "tensorboard":
-        return _Tee(files, _TensorboardLogger(folder, resume_step))
-    return files
+        return MetricLogger(files, _Tensorboard(folder, resume_step))
+    return MetricLogger(files)
 
 
 def check_backend(backend: str) -> None:
@@ -131,39 +147,48 @@ def check_backend(backend: str) -> None:
         )
 
 
-def read_curve(folder: str | os.PathLike[str], metric: str) -> list[tuple[int, float]]:
-    """The rows ``(step, value)`` of one metric in a run's folder, as written.
+def read_curve(folder: str | os.PathLike[str], metric: str) -> Curve:
+    """One of :func:`read_curves`.
+
+    Raises:
+        FileNotFoundError: the run has no such metric; the message lists those it has.
+        ValueError: see :func:`read_curves`.
+    """
+    path = _curve_path(Path(folder), metric)
+    if not path.is_file():
+        known = ", ".join(_curves(Path(folder))) or "none"
+        raise FileNotFoundError(f"{folder} has no curve {metric!r}; it has {known}.")
+    return _rows(path)
+
+
+def read_curves(folder: str | os.PathLike[str]) -> dict[str, Curve]:
+    """All curves in a run's folder by metric, in order of name, as written; torchrl's ``CSVLogger`` writes the same.
 
     A last row that was cut short by a crash is left out.
 
     Raises:
-        FileNotFoundError: the run has no such metric; the message lists those it has.
+        ValueError: a row that is not ``step,value``; the message names file and line.
     """
-    path = _curve_path(Path(folder), metric)
-    if not path.is_file():
-        known = sorted(str(p.relative_to(path.parents[metric.count("/")]))[:-4] for p in _curves(Path(folder)))
-        raise FileNotFoundError(f"{folder} has no curve {metric!r}; it has {', '.join(known) or 'none'}.")
-    return [(int(step), float(value)) for step, value in complete_rows(path)]
+    return {metric: _rows(path) for metric, path in _curves(Path(folder)).items()}
 
 
-class CsvLogger:
+class _Files:
     """One file for each metric, table and picture; see :func:`make_logger` for the arguments."""
 
     def __init__(self, folder: Path, config: Mapping[str, Any], resume_step: int | None) -> None:
         text = json.dumps(config, indent=2, sort_keys=True)
         folder.mkdir(parents=True, exist_ok=True)
         write_bytes(folder / "config.json", f"{text}\n".encode())
-        for path in _curves(folder):
+        for path in _curves(folder).values():
             _drop_rows_after(path, resume_step)
-        for path in _exhibits(folder):
-            if resume_step is None or int(path.stem) > resume_step:
-                path.unlink()
-        self._folder, self._resume_step = folder, resume_step
+        for path in _exhibits(folder) if resume_step is None else ():
+            path.unlink()
+        self._folder = folder
         self._files: dict[str, TextIO] = {}
 
-    def log(self, metrics: Mapping[str, Any], step: int) -> None:
+    def log(self, metrics: Mapping[str, float], step: int) -> None:
         """Append one row per metric, in one write each: a crash leaves at most one incomplete last row."""
-        for name, value in _as_floats(metrics).items():
+        for name, value in metrics.items():
             if name not in self._files:
                 path = _curve_path(self._folder, name)
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -171,47 +196,29 @@ class CsvLogger:
             self._files[name].write(f"{step},{value}\n")
             self._files[name].flush()
 
-    def table(self, name: str, header: Sequence[str], rows: Sequence[Sequence[Any]], step: int) -> None:
-        """Write ``tables/<name>/<step>.csv``; see :class:`MetricLogger`."""
-        self.keep_table(as_table(name, header, rows), step)
-
-    def picture(self, name: str, picture: Any, step: int) -> None:
-        """Write ``pictures/<name>/<step>.png`` or copy the file there; see :class:`MetricLogger`."""
-        self.keep_picture(as_picture(name, picture), step)
-
-    def keep_table(self, table: Table, step: int) -> bool:
-        """Write a table; False if an earlier run has done it."""
+    def table(self, table: Table, step: int) -> None:
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows([table.header, *table.rows])
-        return self._keep("tables", table.name, step, "csv", text.getvalue().encode())
+        self._keep("tables", table.name, f"{step}.csv", text.getvalue().encode())
 
-    def keep_picture(self, picture: Picture, step: int) -> bool:
-        """Write a picture; False if an earlier run has done it."""
-        return self._keep("pictures", picture.name, step, picture.suffix, picture.content)
+    def picture(self, picture: Picture, step: int) -> None:
+        self._keep("pictures", picture.name, f"{step}.{picture.suffix}", picture.content)
 
-    def _keep(self, kind: str, name: str, step: int, suffix: str, content: bytes) -> bool:
+    def _keep(self, kind: str, name: str, file: str, content: bytes) -> None:
         folder = self._folder / kind / name
-        if any(folder.glob(f"{step}.*")):
-            if self._resume_step is not None and step <= self._resume_step:
-                return False
-            raise ValueError(f"{kind}/{name} of step {step} has been written already; give another name or step.")
         folder.mkdir(parents=True, exist_ok=True)
-        write_bytes(folder / f"{step}.{suffix}", content)
-        return True
+        write_bytes(folder / file, content)
 
     def close(self) -> None:
-        """Close the files."""
         for file in self._files.values():
             file.close()
         self._files.clear()
 
 
-class _WandbLogger:
+class _Wandb:
     """Weights & Biases. The run's id is kept in the folder, so a resumed run goes on in the same run."""
 
-    def __init__(
-        self, folder: Path, config: Mapping[str, Any], resume_step: int | None, project: str, name: str, mode: str
-    ) -> None:
+    def __init__(self, folder: Path, config: Mapping[str, Any], resume_step: int | None, name: str, mode: str) -> None:
         import wandb
 
         id_file = folder / "wandb_id.txt"
@@ -219,22 +226,22 @@ class _WandbLogger:
             write_bytes(id_file, f"{secrets.token_hex(4)}\n".encode())
         run_id = id_file.read_text().strip()
         self._run = wandb.init(
-            project=project, name=name, id=run_id, resume="allow", dir=folder, config=dict(config), mode=mode
+            project=PROJECT, name=name, id=run_id, resume="allow", dir=folder, config=dict(config), mode=mode
         )
         # Its own step counter cannot go back to the step of a checkpoint, so our step is a metric of its own.
         self._run.define_metric("step")
         self._run.define_metric("*", step_metric="step")
 
-    def log(self, metrics: Mapping[str, Any], step: int) -> None:
-        self._run.log({"step": step, **_as_floats(metrics)})
+    def log(self, metrics: Mapping[str, float], step: int) -> None:
+        self._run.log({"step": step, **metrics})
 
-    def show_table(self, table: Table, step: int) -> None:
+    def table(self, table: Table, step: int) -> None:
         from wandb import Table as WandbTable
 
         shown = WandbTable(columns=table.header, data=table.rows, allow_mixed_types=True)
         self._run.log({"step": step, table.name: shown})
 
-    def show_picture(self, picture: Picture, step: int) -> None:
+    def picture(self, picture: Picture, step: int) -> None:
         from wandb import Image
 
         self._run.log({"step": step, picture.name: Image(picture.pixels)})
@@ -243,7 +250,7 @@ class _WandbLogger:
         self._run.finish()
 
 
-class _TensorboardLogger:
+class _Tensorboard:
     """TensorBoard events; what lies after the resumed step is purged by TensorBoard's own means."""
 
     def __init__(self, folder: Path, resume_step: int | None) -> None:
@@ -252,44 +259,18 @@ class _TensorboardLogger:
         purge = 0 if resume_step is None else resume_step + 1
         self._writer = SummaryWriter(str(folder / "tensorboard"), purge_step=purge)
 
-    def log(self, metrics: Mapping[str, Any], step: int) -> None:
-        for name, value in _as_floats(metrics).items():
+    def log(self, metrics: Mapping[str, float], step: int) -> None:
+        for name, value in metrics.items():
             self._writer.add_scalar(name, value, step)
 
-    def show_table(self, table: Table, step: int) -> None:
+    def table(self, table: Table, step: int) -> None:
         self._writer.add_text(table.name, as_markdown(table), step)
 
-    def show_picture(self, picture: Picture, step: int) -> None:
+    def picture(self, picture: Picture, step: int) -> None:
         self._writer.add_image(picture.name, picture.pixels, step, dataformats="HWC")
 
     def close(self) -> None:
         self._writer.close()
-
-
-class _Tee:
-    """Writes files, and shows the same elsewhere. The files say what an earlier run has shown."""
-
-    def __init__(self, files: CsvLogger, screen: _WandbLogger | _TensorboardLogger) -> None:
-        self._files, self._screen = files, screen
-
-    def log(self, metrics: Mapping[str, Any], step: int) -> None:
-        metrics = _as_floats(metrics)
-        self._files.log(metrics, step)
-        self._screen.log(metrics, step)
-
-    def table(self, name: str, header: Sequence[str], rows: Sequence[Sequence[Any]], step: int) -> None:
-        table = as_table(name, header, rows)
-        if self._files.keep_table(table, step):
-            self._screen.show_table(table, step)
-
-    def picture(self, name: str, picture: Any, step: int) -> None:
-        picture = as_picture(name, picture)
-        if self._files.keep_picture(picture, step):
-            self._screen.show_picture(picture, step)
-
-    def close(self) -> None:
-        self._files.close()
-        self._screen.close()
 
 
 def _as_floats(metrics: Mapping[str, Any]) -> dict[str, float]:
@@ -305,8 +286,9 @@ def _curve_path(folder: Path, metric: str) -> Path:
     return folder / "scalars" / f"{metric}.csv"
 
 
-def _curves(folder: Path) -> list[Path]:
-    return sorted((folder / "scalars").rglob("*.csv"))
+def _curves(folder: Path) -> dict[str, Path]:
+    scalars = folder / "scalars"
+    return {path.relative_to(scalars).as_posix()[:-4]: path for path in sorted(scalars.rglob("*.csv"))}
 
 
 def _exhibits(folder: Path) -> list[Path]:
@@ -314,7 +296,18 @@ def _exhibits(folder: Path) -> list[Path]:
     return sorted(path for path in found if path.is_file() and path.stem.isdigit())
 
 
-def complete_rows(path: Path) -> list[list[str]]:
+def _rows(path: Path) -> Curve:
+    rows = []
+    for line, row in enumerate(_complete_rows(path), start=1):
+        try:
+            step, value = row
+            rows.append((int(step), float(value)))
+        except ValueError as error:
+            raise ValueError(f"{path}:{line}: expected 'step,value', got {','.join(row)!r}.") from error
+    return rows
+
+
+def _complete_rows(path: Path) -> list[list[str]]:
     """Rows of a curve's file, without a last one that a kill cut short."""
     lines = path.read_text().splitlines(keepends=True)
     return [line.strip().split(",") for line in lines if line.endswith("\n")]
@@ -322,7 +315,7 @@ def complete_rows(path: Path) -> list[list[str]]:
 
 def _drop_rows_after(path: Path, step: int | None) -> None:
     try:
-        rows = [] if step is None else [row for row in complete_rows(path) if int(row[0]) <= step]
+        rows = [] if step is None else [row for row in _complete_rows(path) if int(row[0]) <= step]
     except ValueError as error:
         raise ValueError(f"{path} is no curve ({error}); remove it and run again.") from None
     if rows:

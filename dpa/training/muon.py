@@ -22,7 +22,7 @@ RMS = 0.6
 al. 2025); matrices bear three times as much, other parameters diverge there (docs/studies/references.md)."""
 
 
-def orthogonalised(matrix: Tensor, rounds: int = ROUNDS) -> Tensor:
+def orthogonalised(matrix: Tensor) -> Tensor:
     """About ``U V^T`` of matrices ``U S V^T``, by Newton-Schulz iterations.
 
     Singular values come to lie between 0.68 and 1.13, but for those below a hundredth of the matrix's norm, which stay
@@ -30,7 +30,6 @@ def orthogonalised(matrix: Tensor, rounds: int = ROUNDS) -> Tensor:
 
     Args:
         matrix: ``[..., n, m]``.
-        rounds: of the iteration.
 
     Examples:
         >>> made = orthogonalised(torch.randn(2, 8, 5, generator=torch.Generator().manual_seed(0)))
@@ -42,7 +41,7 @@ def orthogonalised(matrix: Tensor, rounds: int = ROUNDS) -> Tensor:
     tall = matrix.shape[-2] > matrix.shape[-1]
     x = matrix.mT if tall else matrix
     x = x / x.norm(dim=(-2, -1), keepdim=True).clamp(min=1e-7)
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         gram = x @ x.mT
         x = a * x + (b * gram + c * gram @ gram) @ x
     return x.mT if tall else x

@@ -1,15 +1,15 @@
 """Bird's-eye pictures of a scene: its map, its lights, its agents and where they went.
 
 A picture has three layers that can be used alone: :func:`draw_map` (never changes), :func:`draw_trails` (one set per
-rollout) and :func:`draw_agents` (one per step). :func:`draw_scene` is all of them; :func:`render_frames` draws the map
-once and then only what moves. From a shell::
+rollout) and :func:`draw_agents` (one per step). :func:`render_frames` is all of them; it draws the map once and then
+only what moves. From a shell::
 
     python -m envs.render STORE --scene 637f20cafde22ff8 --out scene.png
     python -m envs.render STORE --scene 0 --out scene.mp4
 """
 
 from envs.render.layers import View, box_corners, draw_agents, draw_map, draw_trails, fit_view, frame_view, pose_tracks
-from envs.render.picture import draw_scene, frames_over, render_frame, render_frames
+from envs.render.picture import frames_over, render_frame, render_frames
 from envs.render.save import check_writable, save_picture
 
 __all__ = [
@@ -18,7 +18,6 @@ __all__ = [
     "check_writable",
     "draw_agents",
     "draw_map",
-    "draw_scene",
     "draw_trails",
     "fit_view",
     "frame_view",

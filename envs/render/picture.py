@@ -1,4 +1,4 @@
-"""Whole pictures: a scene on axes, frames of an animation, PNG and GIF files."""
+"""Whole pictures: a step of a scene, and frames of an animation."""
 
 from __future__ import annotations
 
@@ -18,45 +18,6 @@ from envs.render.style import AGENT_COLORS, INK_COLOR, LIGHT_GROUP, LIGHT_STYLE,
 from envs.scene import CURRENT_STEP, LOG_STEPS, STEP_SECONDS, AgentKind, MapKind, Scene
 
 
-def draw_scene(
-    axes: Axes,
-    scene: Scene,
-    trajectories: Tensor | None = None,
-    *,
-    step: int = CURRENT_STEP,
-    view: View | None = None,
-    trails: bool = True,
-    legend: bool = True,
-) -> None:
-    """Draw one scene at one step: map, lights, agents, the paths behind them (thin) and ahead of them (fading).
-
-    Args:
-        axes: where to draw; its limits, aspect and ticks are set.
-        scene: one uncollated scene.
-        trajectories: ``[A', T, 3 or 4]``, see :func:`pose_tracks`; the log by default.
-        step: 0 to 90; 10 is the current step.
-        view: window; :func:`fit_view` by default.
-        trails: draw the paths.
-        legend: draw colours, a scale and the time.
-
-    Raises:
-        ValueError: a step outside the scene, or trajectories that do not fit it.
-
-    Examples:
-        >>> from envs.sources.synthetic import straight_road
-        >>> axes = Figure().subplots()
-        >>> draw_scene(axes, straight_road(num_vehicles=3), step=40)
-        >>> [round(float(x)) for x in axes.get_xlim()]
-        [-55, 95]
-    """
-    tracks = pose_tracks(scene, trajectories)
-    frame_view(axes, view or fit_view(scene))
-    draw_map(axes, scene)
-    if legend:
-        _draw_legend(axes, scene)
-    _draw_moment(axes, scene, tracks, step, trails=trails, clock=legend)
-
-
 def render_frames(
     scene: Scene,
     trajectories: Tensor | None = None,
@@ -73,11 +34,14 @@ def render_frames(
         trajectories: ``[A', T, 3 or 4]``, see :func:`pose_tracks`; the log by default.
         steps: steps to render, each 0 to 90.
         view: window, the same for all pictures; :func:`fit_view` by default.
-        trails: draw the paths.
+        trails: draw the paths behind agents (thin) and ahead of them (fading).
         pixels: H and W of a picture.
 
     Yields:
         ``[H, W, 3]`` uint8.
+
+    Raises:
+        ValueError: a step outside the scene, or trajectories that do not fit it.
 
     Examples:
         >>> from envs.sources.synthetic import straight_road
@@ -92,9 +56,7 @@ def render_frames(
     frame_view(axes, view or fit_view(scene))
     draw_map(axes, scene)
     _draw_legend(axes, scene)
-    yield from frames_over(
-        canvas, (_draw_moment(axes, scene, tracks, step, trails=trails, clock=True) for step in steps)
-    )
+    yield from frames_over(canvas, (_draw_moment(axes, scene, tracks, step, trails) for step in steps))
 
 
 def frames_over(canvas: FigureCanvasAgg, moments: Iterable[Sequence[Artist]]) -> Iterator[NDArray[np.uint8]]:
@@ -139,7 +101,7 @@ def render_frame(
     return next(render_frames(scene, trajectories, steps=[step], view=view, trails=trails, pixels=pixels))
 
 
-def _draw_moment(axes: Axes, scene: Scene, tracks: Tensor, step: int, *, trails: bool, clock: bool) -> list[Artist]:
+def _draw_moment(axes: Axes, scene: Scene, tracks: Tensor, step: int, trails: bool) -> list[Artist]:
     """Everything that moves; the artists are returned so that an animation can take them away again."""
     if not 0 <= step < LOG_STEPS:
         raise ValueError(f"step must be 0 to {LOG_STEPS - 1}, got {step}.")
@@ -148,10 +110,8 @@ def _draw_moment(axes: Axes, scene: Scene, tracks: Tensor, step: int, *, trails:
         artists += draw_trails(axes, scene, tracks, 0, step, alpha=0.35, width=0.8)
         artists += draw_trails(axes, scene, tracks, step, LOG_STEPS - 1)
     artists += draw_agents(axes, scene, tracks, step)
-    if clock:
-        text = f"{(step - CURRENT_STEP) * STEP_SECONDS:+.1f} s"
-        artists.append(axes.text(0.985, 0.975, text, transform=axes.transAxes, ha="right", va="top", **_LETTERS))
-    return artists
+    clock = f"{(step - CURRENT_STEP) * STEP_SECONDS:+.1f} s"
+    return [*artists, axes.text(0.985, 0.975, clock, transform=axes.transAxes, ha="right", va="top", **_LETTERS)]
 
 
 _LETTERS = {

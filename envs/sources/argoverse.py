@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -74,27 +73,6 @@ LARGEST_DATA = 128 * 2**20
 scenario has about 0.3, 0.1 and 0.5 MB."""
 
 
-def read_argoverse(path: str | Path, notes: Notes | None = None) -> Scene:
-    """The scene of one scenario, validated.
-
-    Args:
-        path: ``scenario_<id>.parquet``; ``log_map_archive_<id>.json`` must lie beside it.
-        notes: what was not understood and taken for something is counted here.
-
-    Raises:
-        SceneError: naming the file and the field: damaged, too large, a column or entry missing or of the wrong type,
-            not the whole 11 s, no track ``AV``, and all that :meth:`~envs.scene.Scene.validate` refuses.
-        ImportError: the extra ``argoverse`` is not installed.
-
-    Examples:
-        >>> read_argoverse("scenario_none.parquet")
-        Traceback (most recent call last):
-        ...
-        envs.scene.SceneError: scenario_none.parquet: cannot be read (...No such file...).
-    """
-    return next(ARGOVERSE.scenes(str(path), notes))
-
-
 def scene_from_tables(columns: Mapping[str, Any], map_data: Field, name: str, notes: Notes | None = None) -> Scene:
     """One decoded scenario -> scene.
 
@@ -103,10 +81,11 @@ def scene_from_tables(columns: Mapping[str, Any], map_data: Field, name: str, no
             track and time step: positions [m] and velocities [m/s] in city coordinates, headings [rad].
         map_data: what the map's JSON holds.
         name: what errors call it.
-        notes: see :func:`read_argoverse`.
+        notes: what was not understood and taken for something is counted here.
 
     Raises:
-        SceneError: see :func:`read_argoverse`.
+        SceneError: naming the file and the field: a column or entry missing or of the wrong type, not the whole 11 s,
+            no track ``AV``, and all that :meth:`~envs.scene.Scene.validate` refuses.
     """
     notes = Counter() if notes is None else notes
     tracks = read_tracks(columns, name)

@@ -38,36 +38,20 @@ _MOVING_SPEED = 1.0
 """Faster agents travel where they head [m/s]."""
 
 
-def read_gpudrive(path: str | Path) -> Scene:
-    """The scene of one GPUDrive JSON file, validated.
+def scene_from_json(top: Field, notes: Notes | None = None) -> Scene:
+    """One decoded file -> scene.
 
     Tracks without an id have their place in the list for one, map features a negative number. Lights name lanes by id:
     where the map has none, a light belongs to the lane that begins nearest to where it stops traffic. Invalid steps may
     hold anything (-10000 and 0.0001 occur).
 
-    Raises:
-        SceneError: naming the file: not JSON, an entry missing or of the wrong type, not 91 steps, no SDC, and all that
-            :meth:`~envs.scene.Scene.validate` refuses.
-
-    Examples:
-        >>> from tempfile import TemporaryDirectory
-        >>> with TemporaryDirectory() as folder:
-        ...     path = Path(folder) / "scene.json"
-        ...     size = path.write_text('{"scenario_id": "1a"}')
-        ...     read_gpudrive(path)
-        Traceback (most recent call last):
-        ...
-        envs.scene.SceneError: ...scene.json, record 0: objects is missing; ...
-    """
-    return next(GPUDRIVE.scenes(str(path)))
-
-
-def scene_from_json(top: Field, notes: Notes | None = None) -> Scene:
-    """One decoded file -> scene.
-
     Args:
         top: what the JSON holds.
         notes: counts classes, types and states that are not known.
+
+    Raises:
+        SceneError: naming the file: an entry missing or of the wrong type, not 91 steps, no SDC, and all that
+            :meth:`~envs.scene.Scene.validate` refuses.
     """
     notes = Counter() if notes is None else notes
     objects = top["objects"].items(at_least=1)

@@ -28,18 +28,16 @@ def build_scene(
     lines: list[tuple[MapKind, Tensor]],
     *,
     valid: Tensor | None = None,
-    extent: Tensor | None = None,
     kind: Tensor | None = None,
     lights: Lights | None = None,
     scene_id: str = "synthetic",
 ) -> Scene:
-    """A scene from poses and polylines; the first agent is the SDC and every agent is to be predicted.
+    """A scene from poses and polylines; the first agent is the SDC, all are to be predicted and as large as a car.
 
     Args:
         poses: ``[A, L, 3]`` x, y, heading.
         lines: kind and points ``[n, 2]`` or ``[n, 3]`` of each polyline; ``feature_id`` counts from 1.
         valid: ``[A, L]`` bool; all true by default.
-        extent: ``[A, 3]``; a car by default.
         kind: ``[A]``; vehicles by default.
         lights: none by default.
         scene_id: name of the scene.
@@ -66,7 +64,7 @@ def build_scene(
             heading=poses[..., 2],
             velocity=velocity * both[..., None],
             valid=valid,
-            extent=torch.tensor(CAR).expand(num, 3).clone() if extent is None else extent,
+            extent=torch.tensor(CAR).expand(num, 3).clone(),
             kind=torch.full((num,), AgentKind.VEHICLE) if kind is None else kind,
             track_id=torch.arange(num) + 1,
             predict=torch.ones(num, dtype=torch.bool),

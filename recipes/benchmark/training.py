@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from dpa.models.precision import PRECISIONS
-from dpa.report.curves import read_curves
+from dpa.training.loggers import read_curve
 from dpa.training.run import SECONDS
 from envs.progress import progress
 from recipes.common.models import named_models
@@ -129,8 +129,7 @@ def run(case: Case, options: dict[str, Any], scenes: Path, output: Path) -> dict
     done = subprocess.run(command, cwd=case.checkout, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         raise OSError(f"{case} ended with status {done.returncode}: {done.stderr.strip()[-400:]}")
-    curve = read_curves(output)[SECONDS]
-    spent = [step * mean for step, mean in zip(curve["step"], curve["value"], strict=True)]
+    spent = [step * mean for step, mean in read_curve(output, SECONDS)]
     later = len(spent) // 2
     return {
         "first": BATCH * epoch / spent[0],

@@ -20,7 +20,7 @@ import torch
 from envs.geometry.edges import RoadEdges
 from envs.scene import CURRENT_STEP, EDGE_KINDS, LANE_KINDS, AgentKind, LinkKind, MapKind, Scene, SceneError, polylines
 from envs.sources import argoverse, argoverse_map
-from envs.sources.argoverse import ARGOVERSE, SIZES, read_argoverse
+from envs.sources.argoverse import ARGOVERSE, SIZES
 from envs.sources.argoverse_map import HAIRLINE, POINT_SPACING
 from envs.sources.fields import Field
 from tests.envs import made
@@ -29,6 +29,11 @@ from tests.envs.made import ground, lane, line, rectangle
 pytest.importorskip("shapely", reason="needs the extra argoverse")
 
 # --- a street that runs east from (1000, 200) and climbs by 2 % -----------------------------------------------------
+
+
+def read_argoverse(path: str | Path, notes: Counter[str] | None = None) -> Scene:
+    (scene,) = ARGOVERSE.scenes(str(path), notes)
+    return scene
 
 
 def scene_from_tables(columns: dict, map_data: Any, name: str, notes: Counter[str] | None = None) -> Scene:

@@ -15,11 +15,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envs.scene import AgentKind, LightState, MapKind, SceneError
+from envs.scene import AgentKind, LightState, MapKind, Scene, SceneError
 from envs.sources import gpudrive
-from envs.sources.gpudrive import read_gpudrive
+from envs.sources.gpudrive import GPUDRIVE
 from envs.sources.womd import read_womd
 from tests.envs.made import gpudrive_road, newer_gpudrive, older_gpudrive
+
+
+def read_gpudrive(path: Path) -> Scene:
+    (scene,) = GPUDRIVE.scenes(str(path))
+    return scene
 
 
 @pytest.fixture

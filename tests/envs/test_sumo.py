@@ -48,7 +48,7 @@ pytest.importorskip("sumolib", reason="needs the extra `sumo`")
 
 LANE_WIDTH = 3.2
 SMALL = {"windows": 2, "warmup": 15.0, "scenes_per_unit": 4}
-KINDS = [name for name in sumo.presets() if name != "mixed"]
+KINDS = [name for name in sumo_settings()["presets"] if name != "mixed"]
 
 
 # --- simulated scenes ------------------------------------------------------------------------------------------------

@@ -84,14 +84,6 @@ def assert_same_preferences(mine: Path, whole: Path) -> None:
     assert not list(mine.glob(".partial-*"))
 
 
-def test_killed_collection(run: Callable, options: Callable, kill_when: Callable, runs: Path, tmp_path: Path) -> None:
-    arguments = command("collect", options, runs, tmp_path)
-    kill_when(lambda: list((tmp_path / "collect").glob("chunk*")), "collect", *arguments)
-    assert len(PreferenceStore(tmp_path / "collect")) < 6
-    assert run("collect", *arguments).status == 0
-    assert_same_preferences(tmp_path / "collect", runs / "collect")
-
-
 def collect_here(arguments: list[str]) -> None:
     """The command line in a process that has imported it already."""
     sys.argv = ["collect", *arguments]

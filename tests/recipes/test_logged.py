@@ -1,4 +1,4 @@
-"""What an experiment found, read back from the logs of each backend, without a network."""
+"""What an experiment found, read back from its logs; what back ends make of them is with dpa.training.loggers."""
 
 from __future__ import annotations
 
@@ -23,17 +23,11 @@ from dpa.report.table import number
 from dpa.report.text import likelihood_table
 from recipes.experiment.logged import log_experiment
 from tests.dpa.report.runs import BEST, COMMON, GRID, SEEDS, values, write_runs
-from tests.dpa.training.offline import wandb_history
 
 TABLES = {
     "common/methods", "common/safety", "own_best/methods", "own_best/safety", "likelihood/methods", "tuning/decodings",
     "equal_sharpness/methods", "account/stages", "scenes/train", "scenes/tune", "scenes/eval", "learnt/methods",
     "preferences/stores",
-}  # fmt: skip
-OF_METHODS = {name for name in TABLES if name.partition("/")[0] not in ("account", "scenes", "learnt", "preferences")}
-PICTURES = {
-    "own_best/differences", "scenes/likely", "figures/sharpness", "figures/compute", "figures/likelihood",
-    "figures/health",
 }  # fmt: skip
 
 
@@ -45,7 +39,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def files(made: Path) -> tuple[Path, dict[str, Any]]:
     """Logs as files and the experiment; tests may write the same again, and nothing else."""
-    return logged(made, "csv")
+    return logged(made)
 
 
 @pytest.fixture
@@ -61,9 +55,9 @@ def likely(tmp_path: Path) -> Path:
     return tmp_path / "likely.png"
 
 
-def logged(study: Path, backend: str, likely: Path | None = None) -> tuple[Path, dict[str, Any]]:
+def logged(study: Path, likely: Path | None = None) -> tuple[Path, dict[str, Any]]:
     path = study / "experiments/methods.json"
-    cfg: DictConfig = OmegaConf.create({"output": str(study), "logger": {"backend": backend, "mode": "offline"}})
+    cfg: DictConfig = OmegaConf.create({"output": str(study), "logger": {"backend": "csv", "mode": "offline"}})
     pictures = {} if likely is None else {"scenes/likely": likely}
     return log_experiment(cfg, read_experiment(path), pictures), json.loads(path.read_text())
 
@@ -81,6 +75,7 @@ def mean_realism(rows: list[dict[str, Any]], method: str, decoding: list[float])
 
 def test_files_hold_the_tables_numbers_and_picture_of_an_experiment(files: tuple[Path, dict[str, Any]]) -> None:
     folder, found = files
+    assert {path.parent.relative_to(folder / "tables").as_posix() for path in folder.rglob("tables/**/0.csv")} == TABLES
     rows = rows_of(folder, "own_best/methods")
     assert [row["method"] for row in rows] == found["methods"]
     for row in rows:
@@ -151,7 +146,7 @@ def test_hours_and_data_cards_are_tables(files: tuple[Path, dict[str, Any]], stu
     for split, card in read_scene_cards(study / "scenes.json").items():
         assert {row["of all scenes"]: row[split] for row in rows_of(folder, f"scenes/{split}")} == dict(card.facts)
     (study / "scenes.json").unlink()
-    assert not (logged(study, "csv")[0] / "tables/scenes").exists(), "an older study has no cards"
+    assert not (logged(study)[0] / "tables/scenes").exists(), "an older study has no cards"
 
 
 def test_who_learns_the_ranking_is_the_table_of_the_page(files: tuple[Path, dict[str, Any]]) -> None:
@@ -206,59 +201,15 @@ def test_only_pictures_that_were_drawn_of_the_experiment_are_logged(
     files: tuple[Path, dict[str, Any]], study: Path, likely: Path
 ) -> None:
     assert not (files[0] / "pictures/scenes").exists()
-    folder, _ = logged(study, "csv", likely)
+    folder, _ = logged(study, likely)
     assert (folder / "pictures/scenes/likely/0.png").read_bytes() == likely.read_bytes()
 
 
 def test_logs_are_written_anew_when_an_experiment_is_run_again(made: Path, files: tuple[Path, dict[str, Any]]) -> None:
     folder, _ = files
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.suffix == ".csv"}
-    assert before and logged(made, "csv")[0] == folder
+    assert before and logged(made)[0] == folder
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.suffix == ".csv"} == before
-
-
-def test_tensorboard_shows_the_same(study: Path, likely: Path) -> None:
-    folder, found = logged(study, "tensorboard", likely)
-    events = EventAccumulator(str(folder / "tensorboard"), size_guidance={"tensors": 0}).Reload()
-    tags = set(events.Tags()["tensors"])
-    assert {tag.removesuffix("/text_summary") for tag in tags if tag.endswith("/text_summary")} == TABLES
-    assert tags >= PICTURES
-    numbers = {path.relative_to(folder / "scalars").with_suffix("").as_posix(): path for path in curves(folder)}
-    assert tags >= set(numbers), "every number that is in the files"
-    for tag, path in numbers.items():
-        (event,) = events.Tensors(tag)
-        assert event.tensor_proto.float_val[0] == pytest.approx(float(path.read_text().split(",")[1]), abs=1e-5)
-    (table,) = events.Tensors("tuning/decodings/text_summary")
-    lines = table.tensor_proto.string_val[0].decode().splitlines()
-    assert lines[0] == "| method | top-p | temperature | realism ↑ | spread [m] |"
-    assert lines[2].startswith("| reference | 0.95 | 1.0 | ") and len(lines) == 2 + len(found["methods"]) * len(GRID)
-
-
-def curves(folder: Path) -> list[Path]:
-    return sorted((folder / "scalars").rglob("*.csv"))
-
-
-def test_wandb_gets_the_same_offline(study: Path, likely: Path) -> None:
-    folder, _ = logged(study, "wandb", likely)
-    (run,) = (folder / "wandb").glob("offline-run-*")
-    tables = [json.loads(path.read_text()) for path in run.rglob("*.table.json")]
-    assert sorted((len(table["data"]), table["columns"]) for table in tables) == sorted(
-        (len(rows), list(rows[0])) for rows in (rows_of(folder, name) for name in TABLES)
-    )
-    of_methods = [table for table in tables if table["columns"][0] == "method"]
-    assert len(of_methods) == len(OF_METHODS)
-    numbers = {path.relative_to(folder / "scalars").with_suffix("").as_posix(): path for path in curves(folder)}
-    shown = {key: value for row in wandb_history(next(run.glob("*.wandb"))) for key, value in row.items()}
-    assert shown.keys() >= numbers.keys() | {f"{name}/_type" for name in TABLES | PICTURES}
-    for name, path in numbers.items():
-        assert shown[name] == pytest.approx(float(path.read_text().split(",")[1])), name
-    drawn = [folder / "pictures" / name / "0.png" for name in PICTURES]
-    assert sorted(map(size, run.rglob("media/images/**/*.png"))) == sorted(map(size, drawn))
-
-
-def size(picture: Path) -> tuple[int, int]:
-    with Image.open(picture) as image:
-        return image.size
 
 
 if __name__ == "__main__":

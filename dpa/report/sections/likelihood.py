@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from dpa.report.charts import Chart, Line, curves, gallery
-from dpa.report.curves import Curve, read_curves
 from dpa.report.experiment import Experiment
 from dpa.report.likelihoods import ABOUT_LEARNT, LEARNT, Cell, Learnt, likelihoods, shown_figures, who_learns
 from dpa.report.markup import Html, Section, element, folded, hint, joined, sources, table
 from dpa.report.paired import quiet_change, stacked_change
 from dpa.report.study import Evaluations
 from dpa.report.table import REFERENCE, number
+from dpa.training.loggers import Curve, read_curves
 
 SIDES = {
     "tune/nll_preferred": ("preferred", "#2a78b5"),
@@ -136,7 +136,7 @@ def training_charts(
         colours: of the methods.
     """
     runs = {
-        method: [read_curves(folder / run) for run in seeds.values() if (folder / run / "scalars").is_dir()]
+        method: [found for run in seeds.values() if (found := read_curves(folder / run))]
         for method, seeds in experiment.curves.items()
     }
     runs = {method: seeds for method, seeds in runs.items() if seeds}
@@ -156,7 +156,7 @@ def _likelihood(label: str, seeds: Sequence[Mapping[str, Curve]]) -> list[Chart]
 
 def _since_start(curve: Curve) -> Curve:
     """Runs start where their references are, and these lie further apart than training moves them."""
-    return {"step": curve["step"], "value": [value - curve["value"][0] for value in curve["value"]]}
+    return [(step, value - curve[0][1]) for step, value in curve]
 
 
 def _health(
@@ -194,10 +194,10 @@ def blocks(curve: Curve, points: int) -> tuple[list[float], list[float]]:
         points: at most.
 
     Examples:
-        >>> blocks({"step": [1, 2, 3, 4], "value": [1.0, 3.0, 5.0, 7.0]}, 2)
+        >>> blocks([(1, 1.0), (2, 3.0), (3, 5.0), (4, 7.0)], 2)
         ([1.5, 3.5], [2.0, 6.0])
     """
-    known = [(s, v) for s, v in zip(curve["step"], curve["value"], strict=True) if math.isfinite(v)]
+    known = [(step, value) for step, value in curve if math.isfinite(value)]
     size = math.ceil(len(known) / points) or 1
     parts = [known[first : first + size] for first in range(0, len(known), size)]
     means = [tuple(sum(column) / len(part) for column in zip(*part, strict=True)) for part in parts]

@@ -37,7 +37,6 @@ from envs.sources.sumo.options import (
     draw_options,
     make_options,
     parse,
-    presets,
     settings,
     settings_digest,
 )
@@ -45,7 +44,7 @@ from envs.sources.sumo.own import own_network, read_routes, stem
 from envs.sources.sumo.tracks import Tracks, make_tracks
 from envs.sources.sumo.traffic import Recording, Run, simulate_traffic
 
-__all__ = ["SPLITS", "SUMO", "SumoUnit", "generate", "make_options", "parse", "presets", "simulate", "units"]
+__all__ = ["SPLITS", "SUMO", "SumoUnit", "generate", "make_options", "parse", "simulate", "units"]
 
 SPLITS = ("train", "tune", "test")
 """Names of the splits; the place of a name sets the range of its unit numbers."""
@@ -115,7 +114,7 @@ def units(
         num_scenes: scenes in all; the last unit may give fewer than the others.
         seed: 0 to 9999; each seed of each split has networks of its own.
         split: ``"train"``, ``"tune"`` or ``"test"``.
-        preset: see :func:`presets`.
+        preset: name of one in ``sumo.yaml``.
         net: a network file of your own (``.net.xml``) instead of random ones; leave ``preset`` out.
         routes: a route file on that network instead of random traffic.
         **options: overrides of ``sumo.yaml``, see :class:`SumoOptions`.

@@ -71,16 +71,6 @@ def settings_digest() -> int:
     return zlib.crc32(json.dumps(settings(), sort_keys=True).encode())
 
 
-def presets() -> list[str]:
-    """Names of all presets.
-
-    Examples:
-        >>> presets()
-        ['mixed', 'grid', 'town', 'irregular', 'arterial', 'motorway', 'roundabout']
-    """
-    return list(settings()["presets"])
-
-
 def check_names(what: str, asked: Iterable[object], names: Iterable[str]) -> None:
     """Refuse names that do not exist.
 

@@ -47,6 +47,15 @@ def lively_scene(num_agents: int = 3, seed: int = 0, leave: bool = True) -> Scen
     return build_scene(poses, lines, valid=valid, kind=kind, lights=lights, scene_id=f"lively_{num_agents}_{seed}")
 
 
+def with_arrivals(scene: Scene, first_steps: dict[int, int]) -> Scene:
+    """The scene with some agents' logs beginning at later steps."""
+    for agent, step in first_steps.items():
+        for name in ("position", "heading", "velocity", "valid"):
+            getattr(scene.agents, name)[agent, :step] = 0
+    scene.agents.predict[1::3] = False
+    return scene
+
+
 def moved(scene: Scene, motion: Tensor) -> Scene:
     """The same scene somewhere else, turned: ``motion`` is the pose at which its origin ends up."""
     scene = scene.clone()
@@ -84,6 +93,16 @@ def model() -> MotionLM:
 def scene() -> Callable[..., Scene]:
     """Makes :func:`lively_scene`."""
     return lively_scene
+
+
+@pytest.fixture
+def arriving() -> list[Scene]:
+    """Of different sizes, some with agents that come in the middle of a decision, at its end, or never in time."""
+    return [
+        with_arrivals(lively_scene(5, seed=1, leave=False), {1: 23, 3: 15}),
+        lively_scene(2, seed=2),
+        with_arrivals(lively_scene(6, seed=3), {2: 11, 4: 88}),
+    ]
 
 
 @pytest.fixture

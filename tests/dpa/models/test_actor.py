@@ -8,16 +8,16 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from dpa.models import Contexts, MotionActor, collate_contexts
 from dpa.models.context import pad_context
-from dpa.models.motionlm import SIZES, MotionLM, featurize
+from dpa.models.motionlm import MotionLM, featurize
 from dpa.models.sampling import Decoding
-from dpa.tokens import TokenAction, VerletTokenizer
+from dpa.tokens import TokenAction
 from envs import keys
 from envs.episode import EpisodeOptions
 from envs.scene import Scene
@@ -84,59 +84,6 @@ def assert_as_teacher_forced(model: MotionLM, scenes: list[Scene], rollout: Tens
     torch.testing.assert_close(written[controlled], expected[controlled], atol=1e-5, rtol=1e-5)
 
 
-def test_cached_log_probs_equal_those_of_one_teacher_forced_pass(model: MotionLM, scenes: list[Scene]) -> None:
-    env, actor = drive(model, scenes)
-    rollout = env.rollout(16, actor)
-    assert (~rollout[keys.CONTROLLED] & rollout[keys.VALID]).any(), "some agents follow their logs"
-    assert_as_teacher_forced(model, scenes, rollout)
-
-
-@pytest.mark.parametrize("size", sorted(SIZES))
-@pytest.mark.parametrize("tokenizer", [{}, {"interpolation": "linear"}, {"frame": "scene"}])
-def test_the_cache_is_right_for_every_size_and_tokenizer(
-    size: str, tokenizer: dict[str, str], scenes: list[Scene]
-) -> None:
-    torch.manual_seed(0)
-    model = MotionLM(size, VerletTokenizer(**tokenizer)).eval()
-    env, actor = drive(model, scenes)
-    assert_as_teacher_forced(model, scenes, env.rollout(16, actor))
-
-
-def test_the_cache_is_right_episode_after_episode(model: MotionLM, scenes: list[Scene]) -> None:
-    env, actor = drive(model, scenes)
-    rollout = env.rollout(48, actor, break_when_any_done=False)
-    for episode in rollout.split(16, 1):
-        assert_as_teacher_forced(model, scenes, episode)
-    assert rollout[keys.SCENE][::2, ::16].tolist() == [[0, 2, 1], [1, 0, 2]]
-
-
-def run_with_resets(env: TransformedEnv, actor: MotionActor, resets: dict[int, list[bool]], num: int) -> TensorDict:
-    """Roll ``[B, num]`` out; before some steps some rows are reset."""
-    state, steps = env.reset(), []
-    for step in range(num):
-        if step in resets:
-            state = env.reset(state.set("_reset", torch.tensor(resets[step])[:, None])).exclude("_reset")
-        steps.append(env.step(actor(state)))
-        state = steps[-1]["next"].exclude("reward", keys.REWARD)
-    return torch.stack(steps, 1)
-
-
-def test_rows_may_stand_at_different_decisions(model: MotionLM, scenes: list[Scene]) -> None:
-    env, actor = drive(model, scenes)
-    # At 5 one row starts again, at 8 a whole group moves on, at 10 another row starts again.
-    resets = {5: [False, True, False, False], 8: [False, False, True, True], 10: [True, False, False, False]}
-    rollout = run_with_resets(env, actor, resets, 16)
-    assert rollout[keys.SCENE][:, -1].tolist() == [0, 0, 2, 2]
-    for row, start in ((0, 10), (1, 5), (2, 8), (3, 8)):
-        part = rollout[row : row + 1, start:]
-        assert part[keys.STEP][0, :, 0].tolist() == list(range(16 - start))
-        whole = torch.nn.functional.pad(part[keys.TOKEN].transpose(1, 2), (0, start), value=84)
-        expected = teacher_forced(model, scenes, part[keys.SCENE][:, 0], whole)[..., : 16 - start]
-        controlled = part[keys.CONTROLLED][:, 0]
-        written = part[keys.LOG_PROB].transpose(1, 2)
-        torch.testing.assert_close(written[controlled], expected[controlled], atol=1e-5, rtol=1e-5)
-
-
 def test_written_log_probs_are_those_of_the_model_whatever_was_sampled_from(
     model: MotionLM, scenes: list[Scene]
 ) -> None:
@@ -170,11 +117,14 @@ def test_rollouts_of_one_scene_differ(model: MotionLM, scenes: list[Scene]) -> N
     assert not torch.equal(tokens[0], tokens[1])
 
 
-def test_the_deterministic_choice_is_the_most_probable_token(model: MotionLM, scenes: list[Scene]) -> None:
+@pytest.mark.parametrize("kind", [ExplorationType.DETERMINISTIC, ExplorationType.MODE])
+def test_the_choice_without_chance_is_the_most_probable_token(
+    model: MotionLM, scenes: list[Scene], kind: ExplorationType
+) -> None:
     env, actor = drive(model, scenes)
     state = env.reset()
     logits = drive(model, scenes)[1].decide(state)[0].logits
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
+    with set_exploration_type(kind):
         assert torch.equal(actor(state)[keys.TOKEN], logits.argmax(-1))
 
 
@@ -242,13 +192,6 @@ def test_a_scene_is_encoded_once_for_all_its_rollouts_and_decisions(model: Motio
     assert len(encoded) == 1
 
 
-def test_a_tiny_nucleus_is_the_most_probable_token(model: MotionLM, scenes: list[Scene]) -> None:
-    env, actor = drive(model, scenes, decoding=Decoding(top_p=1e-6))
-    state = env.reset()
-    logits = drive(model, scenes)[1].decide(state)[0].logits
-    assert torch.equal(actor(state)[keys.TOKEN], logits.argmax(-1))
-
-
 # --- how the model is run -------------------------------------------------------------------------------------------
 @torch.no_grad()
 def test_bfloat16_changes_the_distribution_by_little(model: MotionLM, scenes: list[Scene]) -> None:
@@ -274,11 +217,6 @@ def test_a_compiled_decoder_gives_the_same_log_probs_and_tokens(model: MotionLM,
     torch.testing.assert_close(found[keys.LOG_PROB][seen], expected[keys.LOG_PROB][seen], atol=1e-5, rtol=1e-5)
 
 
-def test_an_unknown_precision_is_refused(model: MotionLM) -> None:
-    with pytest.raises(ValueError, match="precision must be one of float32, bfloat16, got 'float8'"):
-        MotionActor(model, Contexts([straight_road()], featurize), precision="float8")
-
-
 # --- errors ---------------------------------------------------------------------------------------------------------
 def test_another_number_of_rollouts_than_the_environment_has_is_refused(model: MotionLM) -> None:
     scenes = [straight_road()]
@@ -295,15 +233,6 @@ def test_groups_of_one_batch_that_show_one_scene_differ(model: MotionLM) -> None
     assert len(tokens.unique(dim=0)) == 4
     again = env.rollout(16, actor)[keys.TOKEN].flatten(1)
     assert len(torch.cat((tokens, again)).unique(dim=0)) == 8
-
-
-def test_the_mode_is_the_most_probable_token(model: MotionLM, scenes: list[Scene]) -> None:
-    env, actor = drive(model, scenes)
-    with set_exploration_type(ExplorationType.MODE):
-        mode = env.rollout(2, actor)[keys.TOKEN]
-    env, actor = drive(model, scenes)
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        assert torch.equal(mode, env.rollout(2, actor)[keys.TOKEN])
 
 
 def test_contexts_of_other_agents_are_refused(model: MotionLM) -> None:

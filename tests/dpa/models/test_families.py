@@ -53,6 +53,8 @@ def forced(model: MotionModel, scenes: list[Scene], episode: EpisodeOptions, rol
     contexts = collate_contexts([make_context(scene, model.featurize, episode) for scene in scenes])
     tokens = rolled[keys.TOKEN].transpose(1, 2).unflatten(0, (len(scenes), -1))
     context = pad_context(contexts, tokens.shape[2])
+    for mine, key in ((context.episode.controlled, keys.CONTROLLED), (context.episode.valid, keys.VALID)):
+        assert torch.equal(mine.repeat_interleave(tokens.shape[1], 0), rolled[key][:, 0]), "the same agents"
     valid = context.episode.controlled[:, None, :, None].expand(-1, 1, -1, tokens.shape[3])
     return model.distribution.log_prob(model(context, tokens, valid), tokens).flatten(0, 1)
 
@@ -60,27 +62,32 @@ def forced(model: MotionModel, scenes: list[Scene], episode: EpisodeOptions, rol
 OPTIONS = {
     "plain": EpisodeOptions(),
     "two controlled": EpisodeOptions(max_controlled=2),
-    "arrivals": EpisodeOptions(arrivals=True, max_controlled=3),
+    "arrivals": EpisodeOptions(arrivals=True),
+    "arrivals, two controlled": EpisodeOptions(arrivals=True, max_controlled=2),
+    "only the SDC": EpisodeOptions(control="sdc"),
+    "predicted agents, and arrivals": EpisodeOptions(control="predict", arrivals=True),
+    "a mask, and arrivals": EpisodeOptions(control=lambda scene: scene.agents.track_id % 2 == 1, arrivals=True),
     "short": EpisodeOptions(horizon=5),
 }
 
 
 @families
 @pytest.mark.parametrize("episode", OPTIONS.values(), ids=OPTIONS)
-def test_decision_by_decision_is_as_in_one_pass(family: str, episode: EpisodeOptions, scene: Callable) -> None:
-    model, scenes = make(family), [scene(4, seed=1), scene(6, seed=2)]
-    rolled = drive(model, scenes, episode, rollouts=3)
+def test_decision_by_decision_is_as_in_one_pass(family: str, episode: EpisodeOptions, arriving: list[Scene]) -> None:
+    model = make(family)
+    rolled = drive(model, arriving, episode)
     written, controlled = (rolled[key].transpose(1, 2) for key in (keys.LOG_PROB, keys.CONTROLLED))
-    expected = forced(model, scenes, episode, rolled)
+    assert controlled[..., 0].any(-1).all()
+    expected = forced(model, arriving, episode, rolled)
     assert_as_near(model, written[controlled], expected[controlled])
     assert written[controlled].std() > 0.1, "tokens differ in how likely they are"
 
 
 @families
 @pytest.mark.parametrize("steps", [2, 4, 10])
-def test_decisions_of_any_length_are_as_in_one_pass(family: str, steps: int, scene: Callable) -> None:
-    episode = EpisodeOptions(decision_steps=steps, horizon=min(80 // steps, 12))
-    model, scenes = make(family, tokens_of(family, steps), episode.horizon), [scene(3, seed=1)]
+def test_decisions_of_any_length_are_as_in_one_pass(family: str, steps: int, arriving: list[Scene]) -> None:
+    episode = EpisodeOptions(decision_steps=steps, horizon=min(80 // steps, 12), arrivals=True)
+    model, scenes = make(family, tokens_of(family, steps), episode.horizon), arriving[:1]
     rolled = drive(model, scenes, episode)
     written, controlled = (rolled[key].transpose(1, 2) for key in (keys.LOG_PROB, keys.CONTROLLED))
     expected = forced(model, scenes, episode, rolled)
@@ -120,7 +127,7 @@ def test_where_a_scene_lies_changes_nothing(family: str, motion: tuple, scene: C
     tokens = tokens_for(model, 3)
     here, there = scene(3), move(scene(3), torch.tensor(motion))
     mine, other = (logits_of(model, make_context(each, model.featurize), tokens) for each in (here, there))
-    torch.testing.assert_close(other, mine, atol=2e-3, rtol=0)
+    torch.testing.assert_close(other, mine, atol=2e-4, rtol=0)
 
 
 @families_of_tokens
@@ -175,15 +182,16 @@ SEEN_AT_ONCE = {"behaviorgpt": nobody, "motionlm": nobody, "smart": nobody, "tra
 
 
 @families
-def test_a_token_is_seen_by_those_who_decide_after_it(family: str, scene: Callable) -> None:
+@pytest.mark.parametrize("decision", [0, 6, 15])
+def test_a_token_is_seen_by_those_who_decide_after_it(family: str, decision: int, scene: Callable) -> None:
     model = make(family)
     tokens = tokens_for(model, 4)
     context, other = make_context(scene(4, leave=False), model.featurize), tokens.clone()
-    other[:, :, 1, 6] = 13 * 12 if model.tokenizer.vocab_size else tokens[:, :, 1, 6] / 2
+    other[:, :, 1, decision] = 13 * 12 if model.tokenizer.vocab_size else tokens[:, :, 1, decision] / 2
     changed = (logits_of(model, context, tokens) != logits_of(model, context, other)).any(-1)
-    assert not changed[..., :6].any()
-    assert torch.equal(changed[..., 6], SEEN_AT_ONCE[family](context, 1).expand(1, 2, 4))
-    assert changed[..., 1, 7:].all() and changed[..., 7:].any()
+    assert not changed[..., :decision].any()
+    assert torch.equal(changed[..., decision], SEEN_AT_ONCE[family](context, 1).expand(1, 2, 4))
+    assert changed[..., decision + 1 :].all(), "everybody is near"
 
 
 @families
@@ -196,9 +204,10 @@ def test_padding_and_the_order_of_agents_change_nothing(family: str, scene: Call
         valid = torch.ones(2, 1, 6, 16, dtype=torch.bool)
         both = model(collate_contexts([small, large]), tokens.expand(2, *tokens.shape[1:]), valid)
     torch.testing.assert_close(both[:1, :, :2], alone, atol=1e-5, rtol=0)
-    order = torch.tensor([3, 0, 5, 1, 4, 2])
+    whole, order = logits_of(model, large, tokens), torch.tensor([3, 0, 5, 1, 4, 2])
+    torch.testing.assert_close(both[1:], whole, atol=1e-5, rtol=0)
     shuffled = logits_of(model, keep_agents(large, order), tokens[:, :, order])
-    torch.testing.assert_close(shuffled, logits_of(model, large, tokens)[:, :, order], atol=1e-5, rtol=0)
+    torch.testing.assert_close(shuffled, whole[:, :, order], atol=1e-5, rtol=0)
 
 
 @families
@@ -238,23 +247,26 @@ def test_rows_that_begin_again_have_no_past(family: str, scene: Callable) -> Non
 @families
 def test_rows_may_stand_at_different_decisions_of_scenes_of_different_size(family: str, scene: Callable) -> None:
     model, scenes = make(family), [scene(4, seed=1), scene(2, seed=2), scene(6, seed=3)]
-    env = TrafficEnv(scenes, num_scenes=2, num_rollouts=2, num_agents=6)
+    episode = EpisodeOptions(max_controlled=3)
+    env = TrafficEnv(scenes, episode, num_scenes=2, num_rollouts=2, num_agents=6)
     env = TransformedEnv(env, TokenAction(model.tokenizer))
-    actor = MotionActor(model, Contexts(scenes, model.featurize), num_rollouts=2)
+    actor = MotionActor(model, Contexts(scenes, model.featurize, episode), num_rollouts=2)
     state, steps = env.reset(), []
-    # At 3 a row starts again; a group moves on at 6, from two agents to six, and at 9, to four.
-    resets = {3: [True, False, False, False], 6: [False, False, True, True], 9: [False, False, True, True]}
-    for step in range(12):
+    # At 3 a row starts again; a group moves on at 6, from two agents to six, and at 9, to four; at 12 both do.
+    alone, second, both = [True, False, False, False], [False, False, True, True], [True] * 4
+    resets = {3: alone, 6: second, 9: second, 12: both}
+    for step in range(15):
         if step in resets:
             state = env.reset(state.set("_reset", torch.tensor(resets[step])[:, None])).exclude("_reset")
         steps.append(env.step(actor(state)))
         state = steps[-1]["next"].exclude("reward", keys.REWARD)
     rolled = torch.stack(steps, 1)
-    assert rolled[keys.SCENE][2:, ::3].tolist() == [[1, 1, 2, 0]] * 2
-    for row, first, last in ((0, 0, 3), (0, 3, 12), (1, 0, 12), (2, 0, 6), (2, 6, 9), (3, 9, 12)):
+    assert rolled[keys.SCENE][2:, ::3].tolist() == [[1, 1, 2, 0, 2]] * 2
+    spans = ((0, 0, 3), (0, 3, 12), (1, 0, 12), (2, 0, 6), (2, 6, 9), (3, 9, 12), (1, 12, 15), (2, 12, 15))
+    for row, first, last in spans:
         part = rolled[row : row + 1, first:last]
         played, controlled = [scenes[int(part[keys.SCENE][0, 0])]], part[keys.CONTROLLED].transpose(1, 2)
-        expected = forced(model, played, EpisodeOptions(), part)
+        expected = forced(model, played, episode, part)
         written = part[keys.LOG_PROB].transpose(1, 2)
         torch.testing.assert_close(written[controlled], expected[controlled], atol=1e-5, rtol=0)
 

@@ -11,7 +11,6 @@ import pytest
 
 from dpa.report.experiment import read_experiment
 from dpa.report.table import difference
-from tests.dpa.report.player_reader import SETTLE, Player
 
 DRAWN = "body[data-drawn=yes]"
 WIDE, PHONE = {"width": 1300, "height": 900}, {"width": 390, "height": 844}
@@ -118,69 +117,6 @@ def test_the_player_draws_its_scene(page: Any) -> None:
         "c => new Set(new Uint32Array(c.getContext('2d').getImageData(0, 0, c.width, c.height).data.buffer)).size"
     )
     assert colours > 5
-
-
-@pytest.fixture(scope="module", params=["desktop", pytest.param("phone", marks=pytest.mark.slow)])
-def sized(chromium: Any, study_page: Path, request: pytest.FixtureRequest) -> Iterator[Opened]:
-    """The page at either width, on a phone with a finger."""
-    if request.param == "desktop":
-        yield request.getfixturevalue("opened")
-        return
-    with open_page(chromium, study_page, viewport=PHONE, has_touch=True) as opened:
-        yield opened
-
-
-@pytest.fixture
-def player(sized: Opened, study_page: Path) -> Iterator[Player]:
-    """The player as a reader finds it: now, with the reference's rollout."""
-    if not sized.page.evaluate("navigator.maxTouchPoints"):
-        sized.page.set_viewport_size(WIDE)  # others made it narrow
-    player = Player(sized.page)
-    player.choose("method", "reference")
-    player.at(0)
-    yield player
-    assert sized.said == []
-    assert sized.asked == [study_page.as_uri()]
-    assert sized.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-
-
-def press(player: Player, name: str, **options: Any) -> None:
-    """With what the reader has."""
-    touches = player.page.evaluate("navigator.maxTouchPoints > 0")
-    (player[name].tap if touches else player[name].click)(**options)
-
-
-def test_the_player_plays_and_pauses(player: Player) -> None:
-    before = player.picture("log"), player.picture("roll")
-    press(player, "play")
-    player.wait_past(0.3)
-    press(player, "play")
-    stopped = player.text("clock")
-    assert player.text("play") == "play"
-    assert player.picture("log") != before[0] and player.picture("roll") != before[1]
-    player.page.wait_for_timeout(250)
-    assert player.text("clock") == stopped
-
-
-def test_the_slider_of_the_player_sets_the_time_of_both_pictures(player: Player) -> None:
-    before, box = (player.picture("log"), player.picture("roll")), player["time"].bounding_box()
-    press(player, "time", position={"x": box["width"] / 2, "y": box["height"] / 2})
-    player.page.evaluate(SETTLE)
-    assert float(player.text("clock").removesuffix(" s")) == pytest.approx(3.5, abs=0.1), (
-        "half of 9 s, of which 1 s is history"
-    )
-    assert player.picture("log") != before[0] and player.picture("roll") != before[1]
-
-
-def test_the_player_switches_the_method_and_keeps_the_time(player: Player) -> None:
-    player.at(5.0)
-    log, roll = player.picture("log"), player.picture("roll")
-    assert player.options("method") == ["reference", "DPA-OMF"]
-    player.choose("method", "DPA-OMF")
-    assert "DPA-OMF" in player.text("roll-name") and player.text("clock") == "+5.0 s"
-    assert player.picture("log") == log and player.picture("roll") != roll
-    player.choose("method", "reference")
-    assert "reference" in player.text("roll-name") and player.picture("roll") == roll
 
 
 def test_a_phone_scrolls_tables_and_never_the_page(opened: Opened) -> None:

@@ -119,13 +119,14 @@ def test_keys_play_and_step(player: Player) -> None:
 
 
 # --- what is chosen -------------------------------------------------------------------------------------------------
-def test_another_method_draws_its_own_most_likely_rollout(player: Player) -> None:
+def test_another_method_draws_its_own_most_likely_rollout_at_the_same_time(player: Player) -> None:
     player.at(6.0)
     roll = player.picture("roll")
     player.choose("method", "DPA-OMF")
     assert "DPA-OMF" in player.text("roll-name") and "−0.500 nats" in player.text("roll-name")
     assert player.chosen("rollout").endswith("most likely")
     assert player.picture("roll") != roll and len(player.options("rollout")) == 2
+    assert player.text("clock") == "+6.0 s"
 
 
 def test_another_rollout_is_drawn_and_told(player: Player) -> None:

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from dpa.report.statistics import SEEDS_AND_SCENES as OVER
-from dpa.report.table import cells, header, print_table, summarise, to_markdown
+from dpa.report.table import cells, header, print_whole, summarise, to_markdown, to_rich
 
 
 def test_rows_are_means_over_seeds_in_the_given_order(comparison: dict[str, Any]) -> None:
@@ -59,7 +59,7 @@ def test_a_bar_in_a_name_does_not_split_a_cell_of_markdown() -> None:
 
 def test_a_narrow_terminal_neither_folds_nor_cuts_a_number(comparison: dict[str, Any]) -> None:
     out = io.StringIO()
-    print_table(comparison["rows"], comparison["paired"], title="results", console=Console(file=out, width=40))
+    print_whole(to_rich(comparison["rows"], comparison["paired"], title="results"), Console(file=out, width=40))
     text = out.getvalue()
     assert "+0.018 [+0.006, +0.030]" in text
     assert "…" not in text

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import pytest
 import torch
@@ -11,7 +10,7 @@ from torch import Tensor
 
 from dpa.models import collate_contexts, make_context
 from dpa.models.context import keep_agents
-from dpa.models.motionlm import SIZES, ContextOptions, MotionLM, SceneContext, featurize
+from dpa.models.motionlm import SIZES, MotionLM, SceneContext, featurize
 from dpa.tokens import VerletTokenizer
 from envs.episode import EpisodeOptions
 from envs.scene import Scene
@@ -39,57 +38,6 @@ def all_valid(tokens: Tensor) -> Tensor:
 
 def logits_of(model: MotionLM, context: SceneContext, tokens: Tensor, valid: Tensor | None = None) -> Tensor:
     return model(collate_contexts([context]), tokens, all_valid(tokens) if valid is None else valid)
-
-
-def test_logits_do_not_change_when_the_scene_is_moved_and_turned(
-    model: MotionLM, scene: Callable[..., Scene], move: Callable[[Scene, Tensor], Scene]
-) -> None:
-    tokens = draw(3)
-    here = logits_of(model, make_context(scene(), featurize), tokens)
-    for motion in ((150.0, -80.0, 0.0), (0.0, 0.0, 1.7), (-60.0, 90.0, -2.9)):
-        there = logits_of(model, make_context(move(scene(), torch.tensor(motion)), featurize), tokens)
-        torch.testing.assert_close(there.softmax(-1), here.softmax(-1), **CLOSE)
-
-
-def test_logits_follow_the_order_of_the_agents(model: MotionLM, scene: Callable[..., Scene]) -> None:
-    context, tokens, order = make_context(scene(4), featurize), draw(4), torch.tensor([2, 0, 3, 1])
-    logits = logits_of(model, context, tokens)
-    shuffled = logits_of(model, keep_agents(context, order), tokens[:, :, order])
-    torch.testing.assert_close(shuffled, logits[:, :, order], **CLOSE)
-
-
-@pytest.mark.parametrize("decision", [0, 1, 7, 15])
-def test_a_token_changes_no_decision_up_to_its_own(model: MotionLM, scene: Callable[..., Scene], decision: int) -> None:
-    context, tokens = make_context(scene(4), featurize), draw(4)
-    other = tokens.clone()
-    other[:, :, 1, decision:] = draw(4, seed=1)[:, :, 1, decision:]
-    other[:, :, 1, decision] = 13 * 12
-    changed = (logits_of(model, context, tokens) != logits_of(model, context, other)).any(-1)[0]
-    assert not changed[..., : decision + 1].any()
-    if decision < 15:
-        assert changed[..., decision + 1].all(), "every agent sees at the next decision what the agent did"
-
-
-def test_agents_do_not_see_what_others_choose_at_the_same_time(model: MotionLM, scene: Callable[..., Scene]) -> None:
-    """eq. 1: the joint distribution of a decision is a product over agents."""
-    context, tokens = make_context(scene(3), featurize), draw(3)
-    other = tokens.clone()
-    other[..., 0, 3] = 13 * 12
-    left, right = logits_of(model, context, tokens), logits_of(model, context, other)
-    assert torch.equal(left[..., :4, :], right[..., :4, :])
-
-
-def test_padding_changes_nothing(model: MotionLM, scene: Callable[..., Scene]) -> None:
-    small, large = (
-        make_context(scene(2), featurize),
-        make_context(scene(6, seed=1), partial(featurize, options=ContextOptions(max_pieces=1000))),
-    )
-    tokens = draw(6)
-    alone = logits_of(model, small, tokens[:, :, :2])
-    valid = torch.ones(2, 1, 6, 16, dtype=torch.bool)
-    batch = model(collate_contexts([small, large]), tokens.expand(2, -1, -1, -1), valid)
-    torch.testing.assert_close(batch[:1, :, :2], alone, **CLOSE)
-    torch.testing.assert_close(batch[1:], logits_of(model, large, tokens), **CLOSE)
 
 
 def test_agents_that_are_not_valid_change_nothing(model: MotionLM, scene: Callable[..., Scene]) -> None:
@@ -156,13 +104,6 @@ def test_fewer_tokens_than_the_context_has_decisions_see_the_log_at_the_same_tim
     tokens = draw(3)
     whole, part = logits_of(model, context, tokens), logits_of(model, context, tokens[..., :8])
     torch.testing.assert_close(part, whole[..., :8, :], **CLOSE)
-
-
-def test_everything_that_trains_gets_a_gradient(model: MotionLM, scene: Callable[..., Scene]) -> None:
-    with torch.enable_grad():
-        logits_of(model, make_context(scene(), featurize), draw(3)).log_softmax(-1)[..., 0].sum().backward()
-    without = [name for name, p in model.named_parameters() if p.grad is None or not p.grad.isfinite().all()]
-    assert not without
 
 
 def parameters(size: str) -> int:
