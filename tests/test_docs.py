@@ -354,21 +354,12 @@ def test_the_table_of_the_readme_is_that_of_the_study_beside_the_results(study: 
         assert told[label] == [*(number(record[key], digits) for key, digits in SHOWN.items()), change], label
 
 
-STUDIED_BY = {
-    "sumo": ("driving", r"--config-name driving (.*)"),
-    "gpudrive": ("compare", r"(experiment=\w+ scenes=gpudrive .*)"),
-}
-"""Configuration and arguments of ``recipes.compare`` by which the page of results runs experiments on a source."""
-
-
 def options_told(source: str, experiment: str) -> DictConfig:
-    """The configuration of the command by which the page of results runs an experiment."""
-    told = results()
-    config, pattern = STUDIED_BY[source]
-    commands = re.findall(rf"^ +python -m recipes.compare {pattern}$", told, re.MULTILINE)
+    """The configuration of the command by which the page of results runs an experiment on scenes of a source."""
+    commands = re.findall(r"^ +python -m recipes.compare --config-name driving (.*)$", results(), re.MULTILINE)
     with initialize_config_dir(str(CONFIG), version_base="1.3"):
-        composed = [compose(config, shlex.split(options)) for options in commands]
-    (found,) = [each for each in composed if each.experiment.name == experiment]
+        composed = [compose("driving", shlex.split(options)) for options in commands]
+    (found,) = [each for each in composed if (each.scenes.source, each.experiment.name) == (source, experiment)]
     return found
 
 
