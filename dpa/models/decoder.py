@@ -56,8 +56,12 @@ class NodeDecoder(nn.Module):
         layers: decoder layers.
         horizon: T.
         dropout: on every branch.
-        attention: makes the attention to nodes, of so many channels and heads.
+
+    Attributes:
+        attention: to nodes, made of so many channels and heads.
     """
+
+    attention: type[RelativeAttention]
 
     def __init__(
         self,
@@ -67,8 +71,7 @@ class NodeDecoder(nn.Module):
         feed: int,
         layers: int,
         horizon: int,
-        dropout: float,
-        attention: Callable[[int, int], RelativeAttention],
+        dropout: float = 0.0,
     ) -> None:
         super().__init__()
         self.motion = nn.Sequential(nn.Linear(8, width), nn.GELU(), nn.Linear(width, width))
@@ -79,7 +82,7 @@ class NodeDecoder(nn.Module):
         self.map_vicinity = Vicinity(width, NEAREST_PIECES)
         self.agent_vicinity = Vicinity(width, NEAREST_AGENTS)
         self.layers = nn.ModuleList(
-            DecoderLayer(attention(width, heads), width, heads, feed, dropout) for _ in range(layers)
+            DecoderLayer(self.attention(width, heads), width, heads, feed, dropout) for _ in range(layers)
         )
         self.norm = nn.LayerNorm(width)
         self.head = TokenHead(width, tokenizer)

@@ -185,10 +185,12 @@ def headings_of_nearest_lanes(road: RoadMap, places: Tensor) -> Tensor:
         >>> headings_of_nearest_lanes(straight_road(2).road, torch.tensor([[10.0, 4.0]])).sin().abs() < 1e-6
         tensor([True])
     """
+    if not len(places):
+        return places.new_zeros(0)
     owner = torch.repeat_interleave(torch.arange(len(road.count)), road.count)
     lane = torch.isin(road.kind, torch.tensor(LANE_KINDS)) & (road.count > 1)
     points = lane[owner].nonzero()[:, 0]
-    if not len(points) or not len(places):
+    if not len(points):
         return places.new_zeros(len(places))
     nearest = torch.cdist(places, road.points[points, :2]).argmin(1)
     return _lane_headings(road, owner[points[nearest]], places)

@@ -16,8 +16,8 @@ FEW_SEEDS = 5
 """With fewer training runs a bootstrap interval is too narrow; see :func:`dpa.report.statistics.paired_bootstrap`."""
 
 
-SAYS = {"better": "better", "worse": "Worse", "open": "Not told apart"}
-"""Verdicts in words."""
+SAYS = {"better": "Better", "worse": "Worse", "open": "Not told apart"}
+"""Verdicts in words, each the beginning of a sentence."""
 
 
 def headline(experiment: Experiment) -> str:
@@ -167,7 +167,7 @@ def _has_saturated(run: Path) -> bool:
 
 def ordering(experiment: Experiment) -> str:
     """Which methods can be told apart from ``experiment.versus``, each at its own best decoding."""
-    sides: dict[str, list[str]] = {"better": [], "Worse": [], "Not told apart": []}
+    sides: dict[str, list[str]] = {side: [] for side in SAYS.values()}
     for entry in experiment.own_best.versus:
         sides[SAYS[verdict(entry["ci95"], entry["over"])]].append(experiment.labels[entry["method"]])
     told = ". ".join(f"{side}: {'; '.join(labels)}" for side, labels in sides.items() if labels)

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from dpa.ranking import PreferenceDistance, rank_of
 from dpa.ranking.features import feature_names
+from dpa.safety.off_road import off_road
 from envs.geometry.boxes import nearest_box_distance
-from envs.geometry.edges import RoadEdges
 from envs.scene import EDGE_KINDS, Scene, polylines
 
 COUPLING_STRIDE = 5
@@ -199,10 +199,7 @@ def _mishaps(scene: Scene, poses: Tensor, extent: Tensor, there: Tensor) -> tupl
     size = extent[None, :, None].expand(*poses.shape[:-1], 3)
     boxes = torch.cat((poses[..., [0, 1, 3]], size[..., :2]), -1).transpose(1, 2).contiguous()
     nearest = nearest_box_distance(boxes, there.transpose(1, 2).contiguous()).transpose(1, 2)
-    offroad = torch.zeros_like(there)
-    place, heading = poses[there].split((3, 1), -1)
-    offroad[there] = RoadEdges.from_polylines(lines).box_offroad_distance(place, heading[:, 0], size[there]) > 0
-    return (nearest < 0) & there, offroad
+    return (nearest < 0) & there, off_road(lines, poses, extent, there)
 
 
 def couple(distance: PreferenceDistance, scene: Scene, trajectories: Tensor, agents: Tensor) -> Couplings:

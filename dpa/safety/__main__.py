@@ -18,9 +18,9 @@ from torch import Tensor
 
 from dpa.safety.measure import MEASURES, safety
 from dpa.safety.motion import NOW, logged
-from envs.geometry.edges import RoadEdges
+from dpa.safety.off_road import off_road
 from envs.progress import progress
-from envs.scene import EDGE_KINDS, LOG_STEPS, AgentKind, Scene, polylines
+from envs.scene import EDGE_KINDS, AgentKind, Scene, polylines
 from envs.store import SceneStore
 
 
@@ -33,16 +33,10 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def leaves_road(scene: Scene) -> Tensor:
-    """``[A]`` bool: a corner of an agent's box is off the road at some step after the current one of its log.
-
-    Args:
-        scene: uncollated.
-    """
-    agents, later = scene.agents, slice(NOW + 1, None)
-    extent = agents.extent[:, None].expand(-1, LOG_STEPS - NOW - 1, -1)
-    edges = RoadEdges.from_polylines(polylines(scene, EDGE_KINDS))
-    distance = edges.box_offroad_distance(agents.position[:, later], agents.heading[:, later], extent)
-    return ((distance > 0) & agents.valid[:, later]).any(-1)
+    """``[A]`` bool: an agent of an uncollated scene is off the road at some step of its log after the current one."""
+    agents = scene.agents
+    poses = torch.cat((agents.position, agents.heading[..., None]), -1)[:, NOW + 1 :]
+    return off_road(polylines(scene, EDGE_KINDS), poses, agents.extent, agents.valid[:, NOW + 1 :]).any(-1)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -56,13 +50,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     counts, off = torch.zeros(len(AgentKind), dtype=torch.int64), torch.zeros(len(AgentKind), dtype=torch.int64)
     for index in progress(range(min(len(scenes), options.limit or len(scenes))), "measure", unit="scene"):
         scene = scenes[index]
+        agents, present = scene.agents, scene.agents.present
         log = logged(scene)[None, :, NOW + 1 :]
-        for name, value in safety(scene, log, scene.agents.present[scene.agents.present]).items():
+        for name, value in safety(scene, log, present[present]).items():
             if value is not None:
                 values[name].append(value)
-        present = scene.agents.present
-        counts += scene.agents.kind[present].bincount(minlength=len(AgentKind))
-        off += scene.agents.kind[present & leaves_road(scene)].bincount(minlength=len(AgentKind))
+        counts += agents.kind[present].bincount(minlength=len(AgentKind))
+        off += agents.kind[present & leaves_road(scene)].bincount(minlength=len(AgentKind))
     console = Console(markup=False, width=100)
     for name, known in values.items():
         mean = f"{sum(known) / len(known):.4f}" if known else "–"

@@ -150,8 +150,8 @@ def nearest_others(points: Tensor, count: int) -> Tensor:
     """
     apart = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist")
     copies = (apart == 0).tril(-1).any(1)
-    square, index = apart.masked_fill(copies, torch.inf).topk(min(count, len(points)), largest=False)
-    return torch.where(square.isfinite(), index, index[:, :1])
+    near, index = apart.masked_fill(copies, torch.inf).topk(min(count, len(points)), largest=False)
+    return torch.where(near.isfinite(), index, index[:, :1])
 
 
 def _measure(tokenizer: KDisksTokenizer, _: object) -> None:

@@ -177,7 +177,7 @@ class FactorisedModel(MotionModel):
             x = layer.map(x, layer.map.remember(pieces), map_edges)
             x = layer.agents(x, layer.agents.remember(x), agent_edges)
         x = x.view(scenes, rollouts, decisions, agents, -1)[:, :, -horizon:]
-        kind = context.episode.kind[:, None, None].expand(-1, rollouts, horizon, -1)
+        kind = kind.view(scenes, rollouts, decisions, agents)[:, :, -horizon:]
         return self.decide(self.norm(x), shown.recent, kind).transpose(2, 3)
 
     def history(self, context: NeighbourhoodContext) -> tuple[Tensor, Tensor]:

@@ -16,7 +16,6 @@ from torch import Tensor
 from dpa.models.attention import GAZE, KeyValues, NodeAttention, NodeMasks, added
 from dpa.models.decoder import NodeDecoder
 from dpa.models.encoder import SceneMemory, motion_features
-from dpa.tokens.base import MotionTokenizer
 
 
 class NodeInputs(NamedTuple):
@@ -38,29 +37,9 @@ class NodeInputs(NamedTuple):
 
 
 class MotionDecoder(NodeDecoder):
-    """Logits of the next token of every node.
+    """Logits of the next token of every node; see :class:`~dpa.models.decoder.NodeDecoder` for the arguments."""
 
-    Args:
-        tokenizer: what a token means.
-        width: channels.
-        heads: attention heads.
-        feed: inner channels of a feed-forward layer.
-        layers: decoder layers.
-        horizon: T.
-        dropout: on every branch.
-    """
-
-    def __init__(
-        self,
-        tokenizer: MotionTokenizer,
-        width: int,
-        heads: int,
-        feed: int,
-        layers: int,
-        horizon: int,
-        dropout: float = 0.0,
-    ) -> None:
-        super().__init__(tokenizer, width, heads, feed, layers, horizon, dropout, NodeAttention)
+    attention = NodeAttention
 
     def forward(
         self,

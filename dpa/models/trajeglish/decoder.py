@@ -151,6 +151,8 @@ class TurnDecoder(NodeDecoder):
         dropout: on every branch.
     """
 
+    attention = TurnAttention
+
     def __init__(
         self,
         tokenizer: MotionTokenizer,
@@ -163,7 +165,7 @@ class TurnDecoder(NodeDecoder):
         joint: bool = True,
         dropout: float = 0.0,
     ) -> None:
-        super().__init__(tokenizer, width, heads, feed, layers, horizon, dropout, TurnAttention)
+        super().__init__(tokenizer, width, heads, feed, layers, horizon, dropout)
         self.past, self.joint = past, joint
         self.chosen = nn.Parameter(torch.zeros(width))
 

@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
@@ -22,7 +22,6 @@ VEHICLE, PEDESTRIAN, CYCLIST = AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKin
 FRAMES, INTERPOLATIONS = ("current", "scene"), ("linear", "quadratic")
 tokenizers = st.builds(VerletTokenizer, interpolation=st.sampled_from(INTERPOLATIONS), frame=st.sampled_from(FRAMES))
 kinds = st.sampled_from([VEHICLE, PEDESTRIAN, CYCLIST, AgentKind.OTHER])
-# Of changes that add up to less than the reach of a pedestrian at 2 m/s: beyond it, several mean the same.
 small_changes = st.lists(st.tuples(st.integers(-3, 3), st.integers(-3, 3)), min_size=16, max_size=16)
 
 
@@ -44,13 +43,15 @@ def decode(tokenizer: VerletTokenizer, tokens: list[int], recent: Tensor, kind: 
 
 # --- round trips ----------------------------------------------------------------------------------------------------
 @FEW
-@given(tokenizers, small_changes, kinds, st.floats(0, 1), st.floats(-math.pi, math.pi), st.floats(-300, 300))
+@given(tokenizers, small_changes, kinds, st.floats(0, 5), st.floats(-math.pi, math.pi), st.floats(-300, 300))
 def test_tokens_decode_to_poses_that_encode_to_the_same_tokens(
     tokenizer: VerletTokenizer, changes: list, kind: int, metres: float, heading: float, x: float
 ) -> None:
     tokens = torch.tensor([[token(*change) for change in changes]])
     recent, kind = at_speed(metres, heading, x, -x / 2), torch.tensor([int(kind)])
     poses = tokenizer.decode_tracks(tokens, recent, kind)
+    moved = torch.cat((recent[:, -1:, :2], poses[:, 4::5, :2]), 1).diff(dim=1).norm(dim=-1)
+    assume(moved.max() < (REACH - 1) * tokenizer.bins[kind].min())  # at the reach several changes mean the same
     again = tokenizer.encode_tracks(poses, torch.ones(1, 80, dtype=torch.bool), recent, kind)
     assert again.tokens.tolist() == tokens.tolist()
     torch.testing.assert_close(again.poses, poses)
