@@ -1,4 +1,4 @@
-"""Score a policy: WOSAC realism, minADE, collisions, off-road, the preference distance, and safety.
+"""Score a policy: WOSAC realism, minADE, collisions and off-road, also by class, the preference distance, and safety.
 
 python -m recipes.evaluate policy=runs/pretrain/policy.pt decoding.top_p=0.9 json=runs/reference.json
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 
 from dpa.models import Decoding
 from dpa.ranking import Distance, agent_spread
-from dpa.realism import RealismConfig, RealismResult, mean_result, realism
+from dpa.realism import CLASS_RATES, RealismConfig, RealismResult, class_rates, mean_result, realism
 from dpa.realism.submission import SubmissionWriter, plan_submission
 from dpa.rollout import make_collector
 from dpa.safety import MEASURES, safety
@@ -46,6 +46,7 @@ SCENE_FIGURES = (
     "standing_moved",
     "spread",
     *MEASURES,
+    *CLASS_RATES,
 )
 """Figures of every scene, averaged over scenes."""
 
@@ -131,12 +132,14 @@ def score_scene(each: Rolled, distance: Distance, metric: RealismConfig) -> dict
         distance: how far rollouts are from the log.
         metric: the realism metric.
     """
+    result = realism(each.scene, each.trajectories, metric, features=True)
     return {
-        "result": asdict(realism(each.scene, each.trajectories, metric)),
+        "result": asdict(replace(result, features=None)),
         "preference_distance": distance(each.scene, each.trajectories, each.controlled).distance.mean().item(),
         "standing_moved": standing_moved(each.scene, each.trajectories),
         "spread": final_spread(each.scene, each.trajectories, each.controlled),
         **safety(each.scene, each.trajectories, each.controlled),
+        **class_rates(each.scene, result.features, metric),
     }
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dpa.realism.config import Histogram, Indicator, Kernel, RealismConfig
 from dpa.realism.features import Features, measure
+from dpa.realism.likelihood import CLASS_RATES, class_rates
 from dpa.realism.metric import RealismResult, contributions, mean_result, realism, realism_of, realism_of_groups
 from dpa.realism.quirks import Quirk
 from dpa.realism.tracks import Generated, compare
 
 __all__ = [
+    "CLASS_RATES",
     "Features",
     "Generated",
     "Histogram",
@@ -17,6 +19,7 @@ __all__ = [
     "Quirk",
     "RealismConfig",
     "RealismResult",
+    "class_rates",
     "compare",
     "contributions",
     "mean_result",

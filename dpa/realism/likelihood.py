@@ -12,6 +12,7 @@ from dpa.realism.config import Differences, Histogram, Kernel, RealismConfig
 from dpa.realism.estimators import indicator_log_likelihood, log_likelihood
 from dpa.realism.features import Features
 from dpa.realism.quirks import Quirk
+from envs.scene import AgentKind, Scene
 
 _EVENTS = {
     "collision_indication": "collision_per_step",
@@ -23,6 +24,15 @@ _RATES = {
     "offroad_rate": "offroad_per_step",
     "traffic_light_violation_rate": "traffic_light_violation_per_step",
 }
+
+_OF_CLASS = {
+    "vehicle_collision": (AgentKind.VEHICLE, "collision_per_step"),
+    "pedestrian_collision": (AgentKind.PEDESTRIAN, "collision_per_step"),
+    "cyclist_collision": (AgentKind.CYCLIST, "collision_per_step"),
+    "vehicle_offroad": (AgentKind.VEHICLE, "offroad_per_step"),
+}
+CLASS_RATES = tuple(_OF_CLASS)
+"""Rates of the agents of one class. Those on foot are off the road by rights, so only of vehicles it is told."""
 
 
 class Score(NamedTuple):
@@ -102,6 +112,33 @@ def event_rates(measured: Features, config: RealismConfig) -> dict[str, Tensor]:
         name: _happened(measured, event, config)[1:].float().mean()
         for name, event in _RATES.items()
         if event in measured.values
+    }
+
+
+def class_rates(scene: Scene, measured: Features, config: RealismConfig) -> dict[str, float]:
+    """What the rates of collision and off-road are of the evaluated agents of each class.
+
+    Args:
+        scene: uncollated, as the metric was given it.
+        measured: what the metric measured in it.
+        config: as of the metric.
+
+    Returns:
+        Share of (rollout, agent) pairs by name of :data:`CLASS_RATES`; NaN where nobody of the class is evaluated.
+
+    Examples:
+        >>> from dpa.realism import realism
+        >>> from envs.sources.synthetic import straight_road
+        >>> scene, config = straight_road(num_vehicles=2), RealismConfig.load("2024")
+        >>> piled_up = realism(scene, torch.zeros(4, 2, 80, 4), config, features=True)
+        >>> class_rates(scene, piled_up.features, config)["vehicle_collision"]
+        1.0
+    """
+    agents = scene.agents
+    kind = agents.kind[(agents.track_id == measured.track_id[:, None]).int().argmax(1)]
+    return {
+        name: _happened(measured, event, config)[1:, kind == of].float().mean().item()
+        for name, (of, event) in _OF_CLASS.items()
     }
 
 

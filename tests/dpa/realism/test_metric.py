@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dpa.realism import RealismResult, mean_result, realism, realism_of, realism_of_groups
+from dpa.realism import (
+    CLASS_RATES,
+    RealismConfig,
+    RealismResult,
+    class_rates,
+    mean_result,
+    realism,
+    realism_of,
+    realism_of_groups,
+)
 from envs.scene import CURRENT_STEP, AgentKind, Agents, Scene, collate, select_agents
 from envs.sources.synthetic import straight_road, two_cars_head_on
 from tests.dpa.realism.golden import CODES, SHIPPED, Golden, golden_config
@@ -196,6 +206,24 @@ def test_cars_that_meet_head_on_collide_in_every_rollout() -> None:
     result = realism(scene, log_as_rollout(scene).expand(4, -1, -1, -1))
     assert result.collision_rate == 1
     assert result.likelihood["collision_indication"] > 0.99
+
+
+def test_rates_of_classes_are_of_their_evaluated_agents_alone() -> None:
+    """Five on a road in a row; rollouts hold them where they are, and put the third, a pedestrian, onto the fourth."""
+    scene, config = straight_road(num_vehicles=5), RealismConfig.load("2024")
+    scene.agents.kind[2] = AgentKind.PEDESTRIAN
+    scene.agents.predict[:] = torch.tensor([True, True, True, True, False])
+    agents = scene.agents
+    held = torch.cat((agents.position, agents.heading[..., None]), -1)[:, CURRENT_STEP, None].expand(-1, 80, -1)
+    rollouts = held.expand(4, -1, -1, -1).clone()
+    rollouts[0, 2] = rollouts[0, 3]
+    result = realism(scene, rollouts, config, features=True)
+    found = class_rates(scene, result.features, config)
+    assert tuple(found) == CLASS_RATES
+    assert found["pedestrian_collision"] == pytest.approx(1 / 4)
+    assert found["vehicle_collision"] == pytest.approx(1 / 12), "the fifth vehicle is not evaluated"
+    assert math.isnan(found["cyclist_collision"])
+    assert result.collision_rate == pytest.approx((1 / 4 + 3 * 1 / 12) / 4)
 
 
 def test_without_a_scored_vehicle_the_metric_is_not_a_number() -> None:
