@@ -25,7 +25,7 @@ from envs.files import write_json
 from envs.progress import progress
 from envs.scene import CURRENT_STEP
 from envs.store import SceneStore
-from recipes.common.cli import CONFIG, build, deciding, finished, finite, recipe
+from recipes.common.cli import CONFIG, build, deciding, finished, finite, mean_known, recipe
 from recipes.common.models import open_policy, policy_file, weights_digest
 from recipes.common.partial import PartialResult
 from recipes.common.rankings import build_distance
@@ -185,12 +185,6 @@ def final_spread(scene: Any, trajectories: torch.Tensor, controlled: torch.Tenso
     """
     agents = scene.agents
     return agent_spread(trajectories[:, agents.evaluated[agents.present] & controlled]).mean().item()
-
-
-def mean_known(values: list[float | None]) -> float | None:
-    """Mean of the values that are known; None where none is."""
-    known = [value for value in values if value is not None]
-    return sum(known) / len(known) if known else None
 
 
 @hydra.main(**CONFIG, config_name="evaluate")

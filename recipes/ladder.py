@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
+from itertools import compress
 from typing import Any
 
 import hydra
@@ -17,14 +18,14 @@ import numpy as np
 from omegaconf import DictConfig
 from torch import Tensor
 
-from dpa.realism import RealismConfig, realism
+from dpa.realism import CLASS_RATES, RealismConfig, class_rates, realism
 from dpa.report.statistics import summary
 from dpa.training.seeding import seed_everything
 from envs.files import write_json
 from envs.progress import progress
-from envs.scene import SceneSource
+from envs.scene import Scene, SceneSource
 from envs.seeding import make_generator
-from recipes.common.cli import CONFIG, finite, plain, recipe
+from recipes.common.cli import CONFIG, finite, mean_known, plain, recipe
 from recipes.common.models import episode_options, fresh_policy, open_policy, policies_of, policy_config, weights_digest
 from recipes.common.rolled import driven
 from recipes.common.scenes import fingerprint, open_splits
@@ -32,8 +33,15 @@ from recipes.studies.rows import read_or_score
 from recipes.studies.rungs import Rung, constant_velocity, logged, noisy_log, random_tokens, tokenized_log
 from recipes.studies.tables import StudyTable, tell
 
-BESIDES = {"min_ade": "minADE [m]", "collision_rate": "collision", "offroad_rate": "off-road"}
-"""What is told beside realism."""
+BESIDES = {
+    "min_ade": "minADE [m]",
+    "collision_rate": "collision",
+    **{name: name.replace("_", " ") for name in CLASS_RATES},
+    "offroad_rate": "off-road",
+}
+"""What is told beside realism; of a class, over the scenes that evaluate somebody of it."""
+FIGURES = ("realism", "kinematic", "interactive", "map_based", *BESIDES)
+"""What is kept of every scene."""
 
 
 def score_rung(scenes: SceneSource, rollouts: Iterator[tuple[int, Tensor]], years: list[str], name: str) -> dict:
@@ -41,10 +49,14 @@ def score_rung(scenes: SceneSource, rollouts: Iterator[tuple[int, Tensor]], year
     found: dict[int, dict[str, dict[str, float]]] = {}
     with progress(total=len(scenes), description=name, unit="scene") as bar:
         for index, poses in rollouts:
-            found[index] = {year: realism(scenes[index], poses, year).as_dict() for year in years}
+            found[index] = {year: _figures(scenes[index], poses, year) for year in years}
             bar.update()
-    figures = ("realism", "kinematic", "interactive", "map_based", *BESIDES)
-    return {year: {key: [finite(found[i][year][key]) for i in sorted(found)] for key in figures} for year in years}
+    return {year: {key: [finite(found[i][year][key]) for i in sorted(found)] for key in FIGURES} for year in years}
+
+
+def _figures(scene: Scene, poses: Tensor, year: str) -> dict[str, float]:
+    result = realism(scene, poses, year, features=True)
+    return result.as_dict() | class_rates(scene, result.features, RealismConfig.load(year))
 
 
 def crude(scenes: SceneSource, rung: Rung, num_rollouts: int, seed: int) -> Iterator[tuple[int, Tensor]]:
@@ -86,7 +98,13 @@ def climb(cfg: DictConfig, scenes: SceneSource) -> dict[str, dict]:
     if not cfg.years:
         raise ValueError('years is empty: there is no metric to score by; say years=["2024"].')
     metrics = {year: RealismConfig.load(year).describe() for year in years_of(cfg)}
-    common = {"scenes": fingerprint(scenes), "num_rollouts": cfg.num_rollouts, "seed": cfg.seed, "years": metrics}
+    common = {
+        "scenes": fingerprint(scenes),
+        "num_rollouts": cfg.num_rollouts,
+        "seed": cfg.seed,
+        "years": metrics,
+        "figures": list(FIGURES),
+    }
     ladder = {}
     for name, own, rollouts in rungs(cfg, scenes):
         score = partial(score_rung, scenes, rollouts, years_of(cfg), name)
@@ -106,16 +124,16 @@ def table(ladder: dict[str, dict], years: list[str]) -> StudyTable:
         ValueError: there is none.
     """
     last = years[-1]
-    values = {
-        name: np.array([scores[year]["realism"] for year in years] + [scores[last][key] for key in BESIDES], float)
-        for name, scores in ladder.items()
-    }
-    known = ~np.isnan(np.array(list(values.values()))).any((0, 1))
+    realisms = {name: np.array([scores[year]["realism"] for year in years], float) for name, scores in ladder.items()}
+    known = ~np.isnan(np.array(list(realisms.values()))).any((0, 1))
     if not known.any():
         raise ValueError("no scene has realism under every rung; choose scenes with vehicles.")
     rows = {
-        name: [*(summary(row[None, known]) for row in found[: len(years)]), *found[len(years) :, known].mean(-1)]
-        for name, found in values.items()
+        name: [
+            *(summary(row[None, known]) for row in realisms[name]),
+            *(mean_known(list(compress(scores[last][key], known))) for key in BESIDES),
+        ]
+        for name, scores in ladder.items()
     }
     columns = ["rung", *(f"realism {year}" for year in years), *BESIDES.values()]
     left_out = f", {(~known).sum()} left out, which have no realism" if not known.all() else ""

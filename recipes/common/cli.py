@@ -179,6 +179,12 @@ def finite(value: float) -> float | None:
     return value if value == value else None
 
 
+def mean_known(values: list[float | None]) -> float | None:
+    """Mean of the values that are known; None where none is."""
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
+
+
 def finished(path: Path, decided_by: dict[str, Any]) -> dict[str, Any] | None:
     """The content of a result that an earlier run with the same options wrote, or ``None``.
 

@@ -23,11 +23,11 @@ from recipes.alignment.data import ON_POLICY
 from recipes.alignment.likelihoods import PROBED, divergence, make_probes, probe
 from recipes.alignment.watch import Watch
 from recipes.collect import collect
-from recipes.common.cli import finished, finite, told_of
+from recipes.common.cli import finished, finite, mean_known, told_of
 from recipes.common.models import open_policy, policy_config, policy_file, weights_digest
 from recipes.common.rankings import TimedDistance, build_distance, open_ranked_scenes, ranking_options
 from recipes.common.scenes import fingerprint, open_splits
-from recipes.evaluate import evaluate, mean_known
+from recipes.evaluate import evaluate
 from recipes.experiment.methods import drawing_seed, setup_of
 from recipes.experiment.runs import Run, RunFolder
 from recipes.pretrain import pretrain

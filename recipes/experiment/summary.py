@@ -16,9 +16,9 @@ from dpa.report.table import REFERENCE
 from recipes.alignment.data import ON_POLICY, RANKED, ROLLED, num_candidates
 from recipes.alignment.draws import num_drawn
 from recipes.alignment.likelihoods import PROBED
-from recipes.common.cli import plain
+from recipes.common.cli import mean_known, plain
 from recipes.common.scenes import Splits
-from recipes.evaluate import SCENE_FIGURES, mean_known
+from recipes.evaluate import SCENE_FIGURES
 from recipes.experiment.jobs import runs_of, trained_in
 from recipes.experiment.methods import behind, setup_of
 from recipes.experiment.runs import SNAPSHOT, Run, method_of

@@ -24,6 +24,7 @@ from dpa.losses import ContrastivePreferenceLoss, token_network
 from dpa.models import Contexts, make_context
 from dpa.models.motionlm import MotionLM, featurize
 from dpa.preferences import PreferenceStore, PreferenceWriter, nearest_farthest
+from dpa.realism import CLASS_RATES
 from dpa.realism.config import FOLDER
 from dpa.realism.score import score
 from dpa.realism.submission import validate
@@ -1084,6 +1085,8 @@ def test_the_ladder_has_its_rungs_in_order_and_reads_them_back(
     ]  # fmt: skip
     assert mean["log"] > mean["log through tokens"] > mean["random tokens"]
     assert rungs["log"]["2024"]["min_ade"] == [0.0] * 3
+    rates = [rate for name in CLASS_RATES for rate in rungs["log"]["2024"][name]]
+    assert all(rate is None or 0 <= rate <= 1 for rate in rates) and set(rates) != {None}
     content = out.read_text()
     assert "log" in run("ladder", *command).out and out.read_text() == content
 
