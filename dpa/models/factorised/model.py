@@ -25,12 +25,15 @@ from dpa.models.pieces import NUM_LIGHT_STATES
 from dpa.tokens.base import MotionTokenizer
 from envs.episode import HISTORY
 from envs.geometry.frames import to_world
-from envs.scene import NUM_MAP_KINDS, STEP_SECONDS
+from envs.scene import LANE_KINDS, NUM_MAP_KINDS, STEP_SECONDS, AgentKind
 
 QUIET = 0.1
 """Standard deviation of embeddings at first."""
-LOOK_AHEAD = 2.0
-"""An agent sees the map around it, and around where it will be so much later at its speed [s]: lights and bends."""
+LOOKS = (0.0, 2 / 3, 4 / 3, 2.0)
+"""An agent sees the map around it, and where it will be so much later at its speed [s]: the way, its bends and lights.
+
+Of pieces of 5 m those nearest to a fast car reach few metres beyond it, and those around where it will be in 2 s begin
+few metres before: between the two half of the lanes that it takes were unseen."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +173,7 @@ class FactorisedModel(MotionModel):
         kind = context.episode.kind.repeat_interleave(rollouts * decisions, 0)
         x = self.embed(recent, token, kind, context.episode.extent.repeat_interleave(rollouts * decisions, 0))
         pose, pieces, x = recent[:, :, -1], self.read_map(context), x.flatten(0, 1)
-        map_edges = self.map_edges(context, recent)
+        map_edges = self.map_edges(context, recent, kind)
         agent_edges, past = self.agent_edges(pose, valid), self._past_edges(pose, valid, decisions)
         for layer in self.layers:
             x = layer.past(x, layer.past.remember(x), past)
@@ -209,18 +212,25 @@ class FactorisedModel(MotionModel):
         there = (rows_of(others, index), square <= radius**2, feature)
         return Edges(*(value.flatten(0, 1) for value in there))
 
-    def map_edges(self, context: NeighbourhoodContext, recent: Tensor) -> Edges:
-        """From agents that moved so, ``[R, A, F + 1, 3]``, as many rows for each scene, to the pieces of their scene.
+    def map_edges(self, context: NeighbourhoodContext, recent: Tensor, kind: Tensor) -> Edges:
+        """From agents ``[R, A]`` that moved so, ``[R, A, F + 1, 3]``, to the pieces of their scene; R is a multiple of S.
 
-        Half of the pieces are those nearest to the agent, half those nearest to where it will be if it goes on.
+        As many pieces at each of :data:`LOOKS`, none of them twice: around the agent of any kind, ahead of it lanes
+        alone, but for those on foot.
         """
-        most, places = self.config.agent_pieces, context.map_pose
-        recent = recent.unflatten(0, (len(places), -1)).flatten(1, 2)
-        pose, mask = recent[:, :, -1], context.map_valid[:, None].expand(-1, recent.shape[1], -1)
-        ahead = pose + (pose - recent[:, :, 0]) * (LOOK_AHEAD / (self.tokenizer.steps * STEP_SECONDS))
-        near = nearest(pose, places, mask, most - most // 2, ordered=True)
-        beyond = nearest(ahead, places, mask.scatter(-1, near[1], False), most // 2, ordered=True)
-        return self._edges(self.agent_map_edge, pose, places, [near, beyond], self.config.agent_map_radius)
+        places, looks = context.map_pose, len(LOOKS)
+        recent, kind = (value.unflatten(0, (len(places), -1)).flatten(1, 2) for value in (recent, kind))
+        pose = recent[:, :, -1]
+        speed = (pose - recent[:, :, 0]) / (self.tokenizer.steps * STEP_SECONDS)
+        lanes = torch.stack([context.map_kind == lane for lane in LANE_KINDS]).any(0)
+        ways = lanes[:, None] | (kind == AgentKind.PEDESTRIAN)[..., None]
+        unseen, found = context.map_valid[:, None].expand_as(ways), []
+        for look, seconds in enumerate(LOOKS):
+            most = (self.config.agent_pieces + looks - 1 - look) // looks
+            near = nearest(pose + seconds * speed, places, unseen & ways if look else unseen, most, ordered=True)
+            unseen = unseen.scatter(-1, near[1], False)
+            found.append(near)
+        return self._edges(self.agent_map_edge, pose, places, found, self.config.agent_map_radius)
 
     def agent_edges(self, pose: Tensor, valid: Tensor) -> Edges:
         """Among the agents ``[R, A, 3]`` of one decision."""
@@ -330,7 +340,8 @@ class FactorisedMemory:
     def _advance(self, past: Past, seen: Observation, extent: Tensor) -> tuple[Tensor, Past]:
         """``[B, A, width]`` after all layers, and the past with this decision."""
         model, pose = self.model, seen.recent[:, :, -1]
-        map_edges, agent_edges = model.map_edges(self._context, seen.recent), model.agent_edges(pose, seen.valid)
+        map_edges = model.map_edges(self._context, seen.recent, seen.kind)
+        agent_edges = model.agent_edges(pose, seen.valid)
         edges, keys = self._edges(past, pose), []
         x = model.embed(seen.recent, seen.token, seen.kind, extent).flatten(0, 1)
         for layer, pieces, before in zip(model.layers, self._pieces, past.keys, strict=True):
