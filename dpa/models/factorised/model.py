@@ -213,10 +213,15 @@ class FactorisedModel(MotionModel):
         return Edges(*(value.flatten(0, 1) for value in there))
 
     def map_edges(self, context: NeighbourhoodContext, recent: Tensor, kind: Tensor) -> Edges:
-        """From agents ``[R, A]`` that moved so, ``[R, A, F + 1, 3]``, to the pieces of their scene; R is a multiple of S.
+        """From agents that moved so, ``[R, A, F + 1, 3]``, as many rows for each scene, to the pieces of their scene.
 
         As many pieces at each of :data:`LOOKS`, none of them twice: around the agent of any kind, ahead of it lanes
         alone, but for those on foot.
+
+        Args:
+            context: of batch size ``[S]``.
+            recent: see above.
+            kind: ``[R, A]`` of the agents.
         """
         places, looks = context.map_pose, len(LOOKS)
         recent, kind = (value.unflatten(0, (len(places), -1)).flatten(1, 2) for value in (recent, kind))
