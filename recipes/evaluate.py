@@ -46,9 +46,10 @@ SCENE_FIGURES = (
     "standing_moved",
     "spread",
     *MEASURES,
-    *CLASS_RATES,
 )
-"""Figures of every scene, averaged over scenes."""
+"""Figures of every scene, averaged over scenes, that comparisons tell as well."""
+FIGURES = (*SCENE_FIGURES, *CLASS_RATES)
+"""Those that an evaluation tells."""
 
 
 def evaluate(
@@ -72,7 +73,7 @@ def evaluate(
         open_submission: where the rollouts go as well, from :func:`~dpa.realism.submission.plan_submission`.
 
     Returns:
-        ``options``, ``mean`` (each figure of :data:`SCENE_FIGURES`), ``likelihood`` (of each realism feature),
+        ``options``, ``mean`` (each figure of :data:`FIGURES`), ``likelihood`` (of each realism feature),
         ``scenes`` (ids) and ``per_scene`` (each figure as a list).
     """
     options = cfg.evaluation
@@ -91,7 +92,7 @@ def evaluate(
     submission = None if open_submission is None else open_submission(scenes.scene_ids, decided_by)
     if done is not None and (submission is None or submission.finished):
         return done
-    partial = PartialResult(path, decided_by)
+    partial = PartialResult(path, decided_by | {"figures": list(FIGURES)})
     scored = partial.read()
     # A scene is done once it is scored and, where a submission is written, in there as well.
     ready = frozenset(scored) if submission is None else submission.done & scored.keys()
@@ -147,7 +148,7 @@ def summarise(scored: list[dict[str, Any]], scene_ids: list[str]) -> dict[str, A
     """Means over scenes and the figures of each, from what :func:`score_scene` gives for each scene."""
     results = [RealismResult(**entry["result"]) for entry in scored]
     figures = [result.as_dict() | entry for result, entry in zip(results, scored, strict=True)]
-    per_scene = {name: [finite(figure[name]) for figure in figures] for name in SCENE_FIGURES}
+    per_scene = {name: [finite(figure[name]) for figure in figures] for name in FIGURES}
     return {
         "mean": {name: mean_known(values) for name, values in per_scene.items()},
         "likelihood": {name: finite(value) for name, value in mean_result(results).likelihood.items()},
@@ -200,7 +201,7 @@ def main(cfg: DictConfig) -> None:
     scenes = open_splits(cfg.scenes)[cfg.split]
     decoding = build(Decoding, cfg.decoding, "decoding")
     result = evaluate(cfg, scenes, policy_file(cfg.policy), decoding, cfg.seed, Path(cfg.json), plan)
-    width = max(map(len, SCENE_FIGURES))
+    width = max(map(len, FIGURES))
     for name, value in result["mean"].items():
         print(f"{name:{width}}  {'–' if value is None else format(value, '.4f')}")
     print(

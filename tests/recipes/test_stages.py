@@ -50,7 +50,7 @@ from recipes.common.models import open_policy
 from recipes.common.partial import PartialResult
 from recipes.common.rolled import Rolled
 from recipes.common.scenes import open_splits
-from recipes.evaluate import SCENE_FIGURES, final_spread, standing_moved
+from recipes.evaluate import FIGURES, final_spread, standing_moved
 from recipes.experiment.jobs import align_job
 from recipes.experiment.pool import Job, Workers
 from recipes.pretrain import tuning_items
@@ -939,13 +939,13 @@ def scored(run: Callable, options: Callable, runs: Path) -> dict:
     """The result of an evaluation that nothing interrupted."""
     outcome = run("evaluate", *score_into(runs / "evaluation.json", runs, options))
     assert outcome.status == 0, outcome.err
-    assert all(name in outcome.out for name in SCENE_FIGURES)
+    assert all(name in outcome.out for name in FIGURES)
     return json.loads((runs / "evaluation.json").read_text())
 
 
 def test_an_evaluation_has_every_figure_of_every_scene_and_their_means(scored: dict, stores: Path) -> None:
     assert scored["scenes"] == SceneStore(stores / "eval").scene_ids
-    assert set(scored["per_scene"]) == set(scored["mean"]) == set(SCENE_FIGURES)
+    assert set(scored["per_scene"]) == set(scored["mean"]) == set(FIGURES)
     for name, values in scored["per_scene"].items():
         known = [value for value in values if value is not None]
         assert len(values) == 3
