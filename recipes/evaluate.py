@@ -140,7 +140,7 @@ def score_scene(each: Rolled, distance: Distance, metric: RealismConfig) -> dict
         "standing_moved": standing_moved(each.scene, each.trajectories),
         "spread": final_spread(each.scene, each.trajectories, each.controlled),
         **safety(each.scene, each.trajectories, each.controlled),
-        **class_rates(each.scene, result.features, metric),
+        **class_rates(result.features, metric),
     }
 
 

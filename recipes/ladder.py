@@ -8,7 +8,7 @@ that are there are read back.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 from itertools import compress
 from typing import Any
@@ -44,19 +44,21 @@ FIGURES = ("realism", "kinematic", "interactive", "map_based", *BESIDES)
 """What is kept of every scene."""
 
 
-def score_rung(scenes: SceneSource, rollouts: Iterator[tuple[int, Tensor]], years: list[str], name: str) -> dict:
+def score_rung(
+    scenes: SceneSource, rollouts: Iterator[tuple[int, Tensor]], metrics: Mapping[str, RealismConfig], name: str
+) -> dict:
     """``{year: {figure: one value per scene}}`` of one rung; None where a scene has none."""
     found: dict[int, dict[str, dict[str, float]]] = {}
     with progress(total=len(scenes), description=name, unit="scene") as bar:
         for index, poses in rollouts:
-            found[index] = {year: _figures(scenes[index], poses, year) for year in years}
+            found[index] = {year: _figures(scenes[index], poses, metric) for year, metric in metrics.items()}
             bar.update()
-    return {year: {key: [finite(found[i][year][key]) for i in sorted(found)] for key in FIGURES} for year in years}
+    return {year: {key: [finite(found[i][year][key]) for i in sorted(found)] for key in FIGURES} for year in metrics}
 
 
-def _figures(scene: Scene, poses: Tensor, year: str) -> dict[str, float]:
-    result = realism(scene, poses, year, features=True)
-    return result.as_dict() | class_rates(scene, result.features, RealismConfig.load(year))
+def _figures(scene: Scene, poses: Tensor, metric: RealismConfig) -> dict[str, float]:
+    result = realism(scene, poses, metric, features=True)
+    return result.as_dict() | class_rates(result.features, metric)
 
 
 def crude(scenes: SceneSource, rung: Rung, num_rollouts: int, seed: int) -> Iterator[tuple[int, Tensor]]:
@@ -97,17 +99,17 @@ def climb(cfg: DictConfig, scenes: SceneSource) -> dict[str, dict]:
     """
     if not cfg.years:
         raise ValueError('years is empty: there is no metric to score by; say years=["2024"].')
-    metrics = {year: RealismConfig.load(year).describe() for year in years_of(cfg)}
+    metrics = {year: RealismConfig.load(year) for year in years_of(cfg)}
     common = {
         "scenes": fingerprint(scenes),
         "num_rollouts": cfg.num_rollouts,
         "seed": cfg.seed,
-        "years": metrics,
+        "years": {year: metric.describe() for year, metric in metrics.items()},
         "figures": list(FIGURES),
     }
     ladder = {}
     for name, own, rollouts in rungs(cfg, scenes):
-        score = partial(score_rung, scenes, rollouts, years_of(cfg), name)
+        score = partial(score_rung, scenes, rollouts, metrics, name)
         ladder[name] = read_or_score(cfg.output, name, common | own, "scores", score)
     return ladder
 

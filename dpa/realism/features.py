@@ -39,6 +39,7 @@ class Features:
             none of generated scenes).
         vehicle: ``[C, E]`` bool.
         track_id: ``[E]`` int64.
+        kind: ``[E]`` :class:`~envs.scene.AgentKind` in the log.
     """
 
     values: dict[str, Tensor]
@@ -46,6 +47,7 @@ class Features:
     valid: Tensor
     vehicle: Tensor
     track_id: Tensor
+    kind: Tensor
 
     def of(self, rollouts: Tensor) -> Features:
         """The measurements of some of the rollouts, ``[R']`` int64; the log stays."""
@@ -103,6 +105,7 @@ def _finish(comparison: Comparison, values: dict[str, Tensor], config: RealismCo
         valid=valid,
         vehicle=tracks.vehicle[:, ego],
         track_id=agents.track_id[ego],
+        kind=agents.kind[ego],
     )
 
 

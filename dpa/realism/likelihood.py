@@ -12,7 +12,7 @@ from dpa.realism.config import Differences, Histogram, Kernel, RealismConfig
 from dpa.realism.estimators import indicator_log_likelihood, log_likelihood
 from dpa.realism.features import Features
 from dpa.realism.quirks import Quirk
-from envs.scene import AgentKind, Scene
+from envs.scene import AgentKind
 
 _EVENTS = {
     "collision_indication": "collision_per_step",
@@ -115,12 +115,11 @@ def event_rates(measured: Features, config: RealismConfig) -> dict[str, Tensor]:
     }
 
 
-def class_rates(scene: Scene, measured: Features, config: RealismConfig) -> dict[str, float]:
+def class_rates(measured: Features, config: RealismConfig) -> dict[str, float]:
     """What the rates of collision and off-road are of the evaluated agents of each class.
 
     Args:
-        scene: uncollated, as the metric was given it.
-        measured: what the metric measured in it.
+        measured: what the metric measured in a scene.
         config: as of the metric.
 
     Returns:
@@ -131,13 +130,11 @@ def class_rates(scene: Scene, measured: Features, config: RealismConfig) -> dict
         >>> from envs.sources.synthetic import straight_road
         >>> scene, config = straight_road(num_vehicles=2), RealismConfig.load("2024")
         >>> piled_up = realism(scene, torch.zeros(4, 2, 80, 4), config, features=True)
-        >>> class_rates(scene, piled_up.features, config)["vehicle_collision"]
+        >>> class_rates(piled_up.features, config)["vehicle_collision"]
         1.0
     """
-    agents = scene.agents
-    kind = agents.kind[(agents.track_id == measured.track_id[:, None]).int().argmax(1)]
     return {
-        name: _happened(measured, event, config)[1:, kind == of].float().mean().item()
+        name: _happened(measured, event, config)[1:, measured.kind == of].float().mean().item()
         for name, (of, event) in _OF_CLASS.items()
     }
 

@@ -218,7 +218,7 @@ def test_rates_of_classes_are_of_their_evaluated_agents_alone() -> None:
     rollouts = held.expand(4, -1, -1, -1).clone()
     rollouts[0, 2] = rollouts[0, 3]
     result = realism(scene, rollouts, config, features=True)
-    found = class_rates(scene, result.features, config)
+    found = class_rates(result.features, config)
     assert tuple(found) == CLASS_RATES
     assert found["pedestrian_collision"] == pytest.approx(1 / 4)
     assert found["vehicle_collision"] == pytest.approx(1 / 12), "the fifth vehicle is not evaluated"
