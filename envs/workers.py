@@ -34,7 +34,7 @@ def run_tasks(work: Work, tasks: Sequence[Task], workers: int, tick: Callable[[i
         tick: called with the number of scenes made since the last call.
 
     Raises:
-        SceneError: a worker was killed.
+        SceneError: a worker was killed, or could not start.
 
     Examples:
         >>> counted = []
@@ -63,10 +63,30 @@ def _run_in_pool(work: Work, tasks: Sequence[Task], workers: int, tick: Callable
                 yield task
     except BrokenProcessPool as error:
         raise SceneError(
-            "a worker was killed, perhaps for want of memory; run it again with fewer workers or smaller shards."
+            "a worker ended: what it said stands above; if nothing, it was killed, perhaps for want of memory: run it "
+            "again with fewer workers or smaller shards."
         ) from error
     finally:
         pool.shutdown()
+
+
+def require_guarded_main() -> None:
+    """Refuse to go on in a worker that runs its parent's script again, since the script starts workers unguarded.
+
+    Python refuses only the start of a process there. What comes before it, such as the wait for a lock that the parent
+    holds, would never end.
+
+    Raises:
+        RuntimeError: this is such a worker.
+
+    Examples:
+        >>> require_guarded_main()
+    """
+    if getattr(multiprocessing.current_process(), "_inheriting", False):  # what multiprocessing.spawn itself looks at
+        raise RuntimeError(
+            "a worker runs the script that started it from the top; put what starts workers under "
+            '`if __name__ == "__main__":`, or use workers=1.'
+        )
 
 
 def lots_done(

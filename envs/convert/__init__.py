@@ -29,7 +29,7 @@ from envs.scene import SceneError
 from envs.shards import ShardRecord, file_digest, read_record
 from envs.sources import SOURCES
 from envs.store import MANIFEST_FILE, Manifest, SceneStore, read_manifest, write_manifest
-from envs.workers import run_tasks
+from envs.workers import require_guarded_main, run_tasks
 
 SHARD_SIZE = 256
 """Scenes in a shard. Each worker holds one shard of packed scenes in memory (about 25 MB for WOMD)."""
@@ -72,6 +72,7 @@ def convert(
         SceneError: a bad input (naming it and the record; finished shards are kept), two scenes of one id, or ``out``
             holds something else.
         ValueError: no such source, or a number that is not positive.
+        RuntimeError: in a worker, which runs the calling script again because it has no ``__main__`` guard.
 
     Examples:
         >>> convert("wmod", ["data"], "out")
@@ -86,6 +87,8 @@ def convert(
             raise ValueError(f"{name} must be 1 or more, got {value}.")
     if shard_size > MOST_IN_SHARD:
         raise ValueError(f"shard_size must be at most {MOST_IN_SHARD}, got {shard_size}.")
+    if workers > 1:
+        require_guarded_main()
     out = Path(out)
     inputs = find_inputs(SOURCES[source], named := list(map(str, paths)))
     options = {"shard_size": shard_size, "limit": limit, "split": split}

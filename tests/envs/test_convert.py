@@ -388,6 +388,16 @@ def test_fifty_kills_at_random_moments_leave_the_bytes_of_an_undisturbed_convers
     assert len(SceneStore(tmp_path / "cut0")) == 60
 
 
+def test_a_script_without_a_main_guard_is_told_so_and_does_not_wait_for_itself(raw: Path, tmp_path: Path) -> None:
+    script = tmp_path / "unguarded.py"
+    call = f"convert('womd', [{str(raw)!r}], {str(tmp_path / 'out')!r}, shard_size=2, workers=2)"
+    script.write_text(f"from envs.convert import convert\n{call}\n")
+    ended = subprocess.run([sys.executable, script], cwd=REPOSITORY, capture_output=True, text=True, timeout=120)
+    assert ended.returncode != 0
+    assert 'under `if __name__ == "__main__":`' in ended.stderr
+    assert "SceneError: a worker ended: what it said stands above" in ended.stderr
+
+
 @pytest.mark.slow
 def test_two_workers_give_the_same_bytes_as_one(raw: Path, tmp_path: Path) -> None:
     convert("womd", [raw], tmp_path / "one", shard_size=2)
