@@ -1,6 +1,6 @@
 """What alignment gains against how good its reference is: finished comparisons side by side.
 
-    python -m recipes.gains 'runs=[runs/driving,runs/smart]' 'methods=[dpa_omf,rloo_realism]'
+    python -m recipes.gains 'name=[competent,families]' 'runs=[runs/driving,runs/smart]' 'methods=[dpa_omf,rloo]'
 
 Of each comparison its reference, with the size of its policy where that is there, and the gain of some methods, best
 decoding against best, with the intervals of the comparison itself. Nothing is run.
@@ -9,10 +9,11 @@ decoding against best, with the intervals of the comparison itself. Nothing is r
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import hydra
-from omegaconf import DictConfig
+from omegaconf import DictConfig, ListConfig
 
 from dpa.report.experiment import Comparison, Experiment, decoding_of, read_experiment
 from dpa.report.paired import scene_values
@@ -66,9 +67,24 @@ def gain_of(comparison: Comparison, method: str) -> Interval:
 def parameters_of(experiment: Experiment, folder: Path) -> float | None:
     """Millions of parameters of the policies; None where their files are elsewhere."""
     policy = folder / f"seed_{experiment.seeds[0]}" / "reference" / "policy.pt"
-    if not policy.is_file():
-        return None
+    if not policy.is_file():  # an archive has no weights, but may name a policy of the zoo
+        named = experiment.config.get("reference")
+        policy = named[0] if isinstance(named, list) else named
+        if not str(policy).startswith("zoo:"):
+            return None
     return num_parameters(open_policy(policy, "cpu")[0]) / 1e6
+
+
+def names_of(name: str | ListConfig, runs: Sequence[str]) -> list[str]:
+    """The experiment of each of the runs: one for all, or one for each.
+
+    Raises:
+        ValueError: another number of names.
+    """
+    names = [name] * len(runs) if isinstance(name, str) else list(name)
+    if len(names) != len(runs):
+        raise ValueError(f"name={names} must be one name for all, or one for each of runs={list(runs)}.")
+    return names
 
 
 @hydra.main(**CONFIG, config_name="gains")
@@ -78,7 +94,8 @@ def main(cfg: DictConfig) -> None:
     methods, output = list(cfg.methods), Path(cfg.output)
     if not cfg.runs or not methods:
         raise ValueError(f"runs={list(cfg.runs)} and methods={methods} must name one or more each.")
-    found = [(Path(runs), read(Path(runs), cfg.name, methods)) for runs in cfg.runs]
+    names = names_of(cfg.name, cfg.runs)
+    found = [(Path(runs), read(Path(runs), name, methods)) for runs, name in zip(cfg.runs, names, strict=True)]
     labels = {method: found[0][1].labels[method] for method in methods}
     rows: dict[str, list[Cell]] = {}
     competence, gains = {}, {label: {} for label in labels.values()}

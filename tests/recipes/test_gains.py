@@ -47,11 +47,31 @@ def test_the_table_has_the_differences_of_the_comparisons_and_the_realism_of_the
     assert float(rows["second"]["realism of the reference"]) == pytest.approx(mean)
 
 
+def test_each_of_the_runs_may_have_an_experiment_of_its_own(run: Callable, studies: list[Path], tmp_path: Path) -> None:
+    write_experiment(tmp_path / "third", "losses", METHODS)
+    outcome = run("gains", *told([studies[0], tmp_path / "third"], tmp_path / "out", "name=[methods,losses]"))
+    assert outcome.status == 0 and "first" in outcome.out and "third" in outcome.out, outcome.err
+
+
+def test_an_archive_tells_the_size_of_a_reference_of_the_zoo(run: Callable, tmp_path: Path) -> None:
+    write_experiment(tmp_path / "runs", "methods", METHODS)
+    path = tmp_path / "runs/experiments/methods.json"
+    content = json.loads(path.read_text())
+    content["config"]["reference"] = ["zoo:motionlm-nano-sumo"]
+    path.write_text(json.dumps(content))
+    outcome = run("gains", *told([tmp_path / "runs"], tmp_path / "out"))
+    assert outcome.status == 0, outcome.err
+    (table,) = (tmp_path / "out/tables").rglob("*.csv")
+    (row,) = csv.DictReader(table.read_text(encoding="utf-8").splitlines())
+    assert float(row["parameters [M]"]) == pytest.approx(0.15, abs=0.01)
+
+
 @pytest.mark.parametrize(
     ("option", "message"),
     [
         ("name=competent", "has no experiment 'competent'"),
         ("methods=[rloo]", "does not compare 'rloo' with its reference; it has dpa_omf, adversarial_afd"),
+        ("name=[methods]", "name=['methods'] must be one name for all, or one for each of runs="),
         ("runs=[]", "runs=[] and methods=['dpa_omf', 'adversarial_afd'] must name one or more each"),
         ("runs=[{0},{0}]", "two of the runs are called 'first'"),
     ],
