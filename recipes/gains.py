@@ -2,8 +2,9 @@
 
     python -m recipes.gains 'name=[competent,families]' 'runs=[runs/driving,runs/smart]' 'methods=[dpa_omf,rloo]'
 
-Of each comparison its reference, with the size of its policy where that is there, and the gain of some methods, best
-decoding against best, with the intervals of the comparison itself. Nothing is run.
+Of each comparison its reference, with family, tokens and size of its policy where that is there, and the gain of some
+methods, best decoding against best, with the intervals of the comparison itself. Nothing is run. ``gains.md`` beside
+the figure is the table for a document.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from dpa.report.paired import scene_values
 from dpa.report.statistics import Interval, summary
 from dpa.report.studies import plot_gains
 from dpa.report.study import Evaluations
+from dpa.report.table import to_markdown
 from recipes.common.cli import CONFIG, recipe
 from recipes.common.models import num_parameters, open_policy
 from recipes.studies.tables import Cell, StudyTable, tell
@@ -64,15 +66,21 @@ def gain_of(comparison: Comparison, method: str) -> Interval:
     return Interval(entry["realism_difference"], *entry["ci95"], entry["over"], entry["n_seeds"], scenes)
 
 
-def parameters_of(experiment: Experiment, folder: Path) -> float | None:
-    """Millions of parameters of the policies; None where their files are elsewhere."""
+def about(experiment: Experiment, folder: Path) -> list[Cell]:
+    """Family, tokens with the size of their vocabulary, and millions of parameters of the policies that were compared.
+
+    None each where their files are elsewhere.
+    """
     policy = folder / f"seed_{experiment.seeds[0]}" / "reference" / "policy.pt"
     if not policy.is_file():  # an archive has no weights, but may name a policy of the zoo
         named = experiment.config.get("reference")
         policy = named[0] if isinstance(named, list) else named
         if not str(policy).startswith("zoo:"):
-            return None
-    return num_parameters(open_policy(policy, "cpu")[0]) / 1e6
+            return [None, None, None]
+    model, _, config = open_policy(policy, "cpu")
+    size = model.tokenizer.vocab_size
+    tokens = f"{config['tokenizer']['name']}, {size}" if size else config["tokenizer"]["name"]
+    return [config["family"], tokens, num_parameters(model) / 1e6]
 
 
 def names_of(name: str | ListConfig, runs: Sequence[str]) -> list[str]:
@@ -107,11 +115,13 @@ def main(cfg: DictConfig) -> None:
         for method, label in labels.items():
             gains[label][name] = gain_of(best, method)
         told = [gains[label][name] for label in labels.values()]
-        rows[name] = [parameters_of(experiment, folder), float(len(experiment.seeds)), competence[name], *told]
+        rows[name] = [*about(experiment, folder), float(len(experiment.seeds)), competence[name], *told]
     output.mkdir(parents=True, exist_ok=True)
     plot_gains(competence, gains, output / "gains.png")
     columns = [
         "runs",
+        "family",
+        "tokens",
         "parameters [M]",
         "seeds",
         "realism of the reference",
@@ -119,8 +129,10 @@ def main(cfg: DictConfig) -> None:
     ]
     reported = ", ".join(dict.fromkeys(f"{each.reported} of {each.scenes['source']}" for _, each in found))
     title = f"{reported}; best decoding against best"
-    tell(cfg, [StudyTable("gains", title, columns, rows, signed=False)], {"gains": output / "gains.png"})
-    print(f"figure: {output / 'gains.png'}")
+    table = StudyTable("gains", title, columns, rows, signed=False)
+    tell(cfg, [table], {"gains": output / "gains.png"})
+    (output / "gains.md").write_text(to_markdown(columns, table.printed()) + "\n", encoding="utf-8")
+    print(f"figure: {output / 'gains.png'}\ntable for a document: {output / 'gains.md'}")
 
 
 if __name__ == "__main__":

@@ -17,8 +17,8 @@ from dpa.report.table import MISSING
 from dpa.training.loggers import make_logger
 from recipes.common.cli import plain
 
-Cell = float | Interval | None
-"""A number, a mean with its interval, or None for what is not known."""
+Cell = float | Interval | str | None
+"""A number, a mean with its interval, words, or None for what is not known."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class StudyTable:
         return [[name, *(_text(cell, sign) for cell in cells)] for name, cells in self.rows.items()]
 
     def kept(self) -> tuple[list[str], list[list[str | float | None]]]:
-        """Header and rows as numbers; where a column has intervals their ends are columns of their own."""
+        """Header and rows as numbers and words; where a column has intervals their ends are columns of their own."""
         titles, rows = [self.columns[0]], [[name] for name in self.rows]
         for title, column in zip(self.columns[1:], zip(*self.rows.values(), strict=True), strict=True):
             wide = any(isinstance(cell, Interval) for cell in column)
@@ -67,7 +67,7 @@ class StudyTable:
         titles, rows = self.kept()
         for column, title in enumerate(titles[1:], 1):
             for row in rows:
-                if row[column] is not None:
+                if isinstance(row[column], int | float):
                     yield f"{self.name}/{_as_name(title)}/{_as_name(row[0])}", row[column]
 
 
@@ -104,12 +104,14 @@ def _as_name(title: str) -> str:
 def _text(cell: Cell, sign: str) -> str:
     if cell is None:
         return MISSING
+    if isinstance(cell, str):
+        return cell
     numbers = (cell.mean, cell.low, cell.high) if isinstance(cell, Interval) else (cell,)
     mean, *ends = (f"{number:{sign}.3f}" for number in numbers)
     return f"{mean} [{', '.join(ends)}]" if ends else mean
 
 
-def _ends(cell: Cell) -> list[float | None]:
+def _ends(cell: Cell) -> list[float | str | None]:
     if isinstance(cell, Interval):
         return [cell.mean, cell.low, cell.high]
     return [cell, None, None]

@@ -53,7 +53,7 @@ def test_each_of_the_runs_may_have_an_experiment_of_its_own(run: Callable, studi
     assert outcome.status == 0 and "first" in outcome.out and "third" in outcome.out, outcome.err
 
 
-def test_an_archive_tells_the_size_of_a_reference_of_the_zoo(run: Callable, tmp_path: Path) -> None:
+def test_an_archive_tells_family_tokens_and_size_of_a_reference_of_the_zoo(run: Callable, tmp_path: Path) -> None:
     write_experiment(tmp_path / "runs", "methods", METHODS)
     path = tmp_path / "runs/experiments/methods.json"
     content = json.loads(path.read_text())
@@ -64,6 +64,9 @@ def test_an_archive_tells_the_size_of_a_reference_of_the_zoo(run: Callable, tmp_
     (table,) = (tmp_path / "out/tables").rglob("*.csv")
     (row,) = csv.DictReader(table.read_text(encoding="utf-8").splitlines())
     assert float(row["parameters [M]"]) == pytest.approx(0.15, abs=0.01)
+    assert (row["family"], row["tokens"]) == ("motionlm", "verlet, 169")
+    titles, _, line = (tmp_path / "out/gains.md").read_text(encoding="utf-8").splitlines()
+    assert titles.startswith("| runs | family | tokens |") and line.startswith("| runs | motionlm | verlet, 169 |")
 
 
 @pytest.mark.parametrize(
