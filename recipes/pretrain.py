@@ -2,7 +2,7 @@
 
     python -m recipes.pretrain                                   # SUMO scenes, made on the spot
     python -m recipes.pretrain scenes=gpudrive scenes.train=DIR scenes.eval=DIR output=runs/reference
-    python -m recipes.pretrain model=nano model.context.max_pieces=256 pretraining.start=zoo:motionlm-nano-sumo
+    python -m recipes.pretrain '~model' pretraining.start=zoo:smart-nano-sumo ...          # goes on from a policy
     torchrun --nproc-per-node 8 -m recipes.pretrain device=cuda pretraining.batch_size=64  # docs/scale.md
 
 The weights that are best on the tuning scenes become ``policy.pt``. Run the same command again to go on after a kill.
@@ -34,6 +34,7 @@ from dpa.training.run import Run
 from dpa.training.seeding import seed_everything
 from envs import keys
 from envs.augment import Augmentation
+from envs.episode import EpisodeOptions
 from envs.files import write_json
 from envs.loader import SceneLoader
 from envs.progress import progress
@@ -45,6 +46,7 @@ from recipes.common.models import (
     digest_of,
     episode_options,
     fresh_policy,
+    open_policy,
     policy_config,
     policy_file,
     write_policy,
@@ -82,7 +84,8 @@ def pretrain(
         ValueError: options that do not fit, or a folder with other options.
     """
     path, result, options = folder / "policy.pt", folder / "result.json", cfg.pretraining
-    config = policy_config(cfg.model)
+    seed_everything(seed)
+    model, episode, config = policy_to_train(cfg)
     decided_by = {
         "policy": config,
         "pretraining": deciding(options, *OBSERVING),
@@ -96,14 +99,13 @@ def pretrain(
     if ranks.agree(finished(result, decided_by) is not None and path.is_file(), "finished =", folder):
         check_written(path)
         return path
-    seed_everything(seed)
     device = ranks.place(cfg.device)
-    model = fresh_policy(cfg.model).to(device)
+    model = model.to(device)
     if origin is not None:
         origin.load_into(model, config)
     best = copy.deepcopy(model)
-    train = training_items(cfg, splits.train, model, seed, ranks)
-    tune = tuning_items(cfg, splits.tune, model, ranks)
+    train = training_items(cfg, splits.train, model, episode, seed, ranks)
+    tune = tuning_items(cfg, splits.tune, model, episode, ranks)
     beside = auxiliary_of(model, options.auxiliary)
     trained = nn.ModuleDict({"policy": model, **beside}).to(device)
     loss = NextTokenLoss(
@@ -157,6 +159,20 @@ def pretrain(
         write_json(result, {"options": decided_by} | told)
     ranks.wait()
     return path
+
+
+def policy_to_train(cfg: DictConfig) -> tuple[MotionModel, EpisodeOptions, dict[str, Any]]:
+    """As ``model`` says, or without it that of ``pretraining.start``, with options of its episodes and configuration.
+
+    Raises:
+        ValueError: there is neither.
+    """
+    if cfg.get("model") is not None:
+        return fresh_policy(cfg.model), episode_options(cfg.model), policy_config(cfg.model)
+    if cfg.pretraining.start is None:
+        raise ValueError("there is no section model: say model=NAME, or pretraining.start=FILE to go on from a policy.")
+    model, *made = open_policy(cfg.pretraining.start)
+    return model.train(), *made
 
 
 def auxiliary_of(model: MotionModel, weight: float) -> dict[str, Auxiliary]:
@@ -239,7 +255,12 @@ def parts_of(items: list[Item], max_rows: int, device: str, ranks: Ranks = ALONE
 
 
 def training_items(
-    cfg: DictConfig, scenes: SceneSource, model: MotionModel, seed: int, ranks: Ranks = ALONE
+    cfg: DictConfig,
+    scenes: SceneSource,
+    model: MotionModel,
+    episode: EpisodeOptions,
+    seed: int,
+    ranks: Ranks = ALONE,
 ) -> SceneLoader:
     """Lists of tokenized logs for this rank, read as they are needed: what is kept of them is bounded."""
     options = cfg.pretraining
@@ -247,7 +268,7 @@ def training_items(
         scenes,
         model.tokenizer.on_cpu(),
         model.featurize,
-        episode_options(cfg.model),
+        episode,
         augment=build(Augmentation, options.augmentation, "pretraining.augmentation"),
         noise=options.noise,
         recovery=options.recovery,
@@ -267,18 +288,20 @@ def training_items(
     )
 
 
-def tuning_items(cfg: DictConfig, scenes: SceneSource, model: MotionModel, ranks: Ranks = ALONE) -> list[Item]:
+def tuning_items(
+    cfg: DictConfig, scenes: SceneSource, model: MotionModel, episode: EpisodeOptions, ranks: Ranks = ALONE
+) -> list[Item]:
     """This rank's part of the tokenized logs of a few scenes, always the same.
 
     Noise is as in training: labels that lead back slowly are not the tokens of clean logs, and by those a policy that
     learns them would be judged by something else.
     """
-    options, learnt = episode_options(cfg.model), cfg.pretraining
+    learnt = cfg.pretraining
     logs = LogItems(
         scenes,
         model.tokenizer.on_cpu(),
         model.featurize,
-        options,
+        episode,
         noise=learnt.noise,
         recovery=learnt.recovery,
         max_agents=learnt.max_agents,
@@ -288,7 +311,7 @@ def tuning_items(cfg: DictConfig, scenes: SceneSource, model: MotionModel, ranks
     if not ranks.sum(torch.tensor(sum(int(item.token_valid.sum()) for item in items))):
         raise ValueError(
             f"none of the {len(scenes)} tuning scenes has a token to predict: no agent that the policy controls "
-            f"(model.episode.control={options.control}) has a log after the current step; say "
+            f"(model.episode.control={episode.control}) has a log after the current step; say "
             "model.episode.control=all, or name other scenes.tune."
         )
     return items

@@ -15,15 +15,16 @@ from dpa.realism.config import RealismConfig
 from dpa.report.experiment import REPORTED, read_experiment
 from dpa.report.table import REFERENCE
 from dpa.rewards import check_horizon
+from envs.episode import EpisodeOptions
 from envs.options import differences
 from recipes.alignment.data import check_data, rewards_of
 from recipes.alignment.losses import check_fit, make_loss
 from recipes.collect import check_collection
 from recipes.common.cli import check_steps, plain, told_of
 from recipes.common.limits import GROUPS, check_limits, is_number
-from recipes.common.models import build_policy, episode_options, policy_config
+from recipes.common.models import build_policy
 from recipes.common.rankings import build_distance, ranking_options
-from recipes.experiment.jobs import reference_of, trained_in
+from recipes.experiment.jobs import check_made_alike, compared_policy, reference_of, trained_in
 from recipes.experiment.methods import policies_of, read_setups
 from recipes.experiment.summary import labels
 
@@ -49,7 +50,6 @@ def check_experiment(cfg: DictConfig) -> None:
     _check_keys(cfg)
     check_limits(cfg)
     check_steps(cfg.pretraining, "pretraining")
-    policy_config(cfg.model)
     RealismConfig.load(str(cfg.evaluation.metric))
     if not cfg.seeds or len(set(cfg.seeds)) < len(cfg.seeds):
         raise ValueError(f"seeds must be one or more, each once, got {list(cfg.seeds)}.")
@@ -57,10 +57,11 @@ def check_experiment(cfg: DictConfig) -> None:
         _check_references(cfg)
     else:
         _check_trained(cfg)
+    policy = compared_policy(cfg)
     _check_decodings(cfg)
     check_collection(cfg.collection)
     _check_rankings(cfg)
-    _check_methods(cfg)
+    _check_methods(cfg, policy)
     _check_report(cfg)
 
 
@@ -110,11 +111,12 @@ def _check_trained(cfg: DictConfig) -> None:
     needed = (runs.policy(seed, policy) for seed in cfg.seeds for policy in policies_of(cfg))
     if missing := next((path for path in needed if not path.is_file()), None):
         raise ValueError(f"{missing} does not exist; finish the experiment there, or leave its seed or method out.")
+    check_made_alike(cfg, runs.policy(cfg.seeds[0], REFERENCE), f"trained={cfg.trained}")
 
 
 def _of_training(config: Mapping[str, Any], methods: Iterable[str]) -> dict[str, Any]:
     """What decides the aligned policies of some methods, beside their references and scenes."""
-    given = {name: config[name] for name in ("model", "rankings", "aligned_scenes")}
+    given = {name: config[name] for name in ("rankings", "aligned_scenes")}
     given["alignment"] = {key: value for key, value in config["alignment"].items() if key not in OF_THE_MACHINE}
     given["collection"] = {key: config["collection"][key] for key in ("num_rollouts", "decoding", "ranking")}
     given["methods"] = {name: config["methods"].get(name) for name in methods}
@@ -152,8 +154,8 @@ def _check_rankings(cfg: DictConfig) -> None:
         )
 
 
-def _check_methods(cfg: DictConfig) -> None:
-    model = build_policy(policy_config(cfg.model))  # a loss is made to see its options refused
+def _check_methods(cfg: DictConfig, policy: dict[str, Any]) -> None:
+    model = build_policy(policy)  # a loss is made to see its options refused
     for name, setup in read_setups(cfg).items():
         if unknown := sorted(set(cfg.methods[name]) - {"name", "data", "loss"}):
             raise ValueError(
@@ -172,7 +174,7 @@ def _check_methods(cfg: DictConfig) -> None:
         with told_of(f"methods.{name}"):
             check_fit(cfg.methods[name], alignment, cfg.collection.num_rollouts)
             data = check_data(cfg.methods[name].data, cfg.collection.num_rollouts)
-            check_horizon(rewards_of(data), episode_options(cfg.model).steps)
+            check_horizon(rewards_of(data), EpisodeOptions(**policy["episode"]).steps)
             make_loss(cfg.methods[name].loss, model)
             check_steps(alignment, "alignment")
 

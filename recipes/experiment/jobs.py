@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -44,18 +45,47 @@ def pretrain_job(cfg: DictConfig, seed: int) -> dict[str, float]:
     return {"pretrain": seconds_trained(folder)}
 
 
+def compared_policy(cfg: DictConfig) -> dict[str, Any]:
+    """What decides the shape of the policies of an experiment: ``model``, or without it what they are made from.
+
+    Raises:
+        ValueError: there is neither.
+    """
+    if cfg.get("model") is not None:
+        return policy_config(cfg.model)
+    if cfg.trained is not None:
+        return open_policy(trained_in(cfg).policy(cfg.seeds[0], REFERENCE))[2]
+    if cfg.reference is None:
+        raise ValueError("there is no section model to train references of; say model=NAME, or reference=FILE.")
+    return open_policy(named_reference(cfg, cfg.seeds[0]))[2]
+
+
+def named_reference(cfg: DictConfig, seed: int) -> str:
+    """The reference that the options name for a seed."""
+    return cfg.reference if isinstance(cfg.reference, str) else cfg.reference[list(cfg.seeds).index(seed)]
+
+
 def reference_of(cfg: DictConfig, seed: int) -> Path:
     """The file of the policy that takes the place of a trained reference.
 
     Raises:
-        ValueError: the zoo has none of this name, or its options are not those of ``model``.
+        ValueError: the zoo has none of this name, or its options are not those of ``model`` or of the first reference.
     """
-    named = cfg.reference if isinstance(cfg.reference, str) else cfg.reference[list(cfg.seeds).index(seed)]
+    named = named_reference(cfg, seed)
     path = policy_file(named)
-    _, _, config = open_policy(path)
-    if differ := differences(config, policy_config(cfg.model)):
-        raise ValueError(f"reference={named} was made with other options than the section model ({differ}).")
+    check_made_alike(cfg, path, f"reference={named}")
     return path
+
+
+def check_made_alike(cfg: DictConfig, policy: Path, name: str) -> None:
+    """All policies of an experiment have one shape.
+
+    Raises:
+        ValueError: a policy has another one.
+    """
+    if differ := differences(open_policy(policy)[2], compared_policy(cfg)):
+        other = "the first one" if cfg.get("model") is None else "the section model"
+        raise ValueError(f"{name} was made with other options than {other} ({differ}).")
 
 
 def adopt_job(cfg: DictConfig, seed: int, policy: str) -> None:

@@ -66,7 +66,8 @@ def test_help_says_what_the_recipe_does_and_takes(run: Callable, recipe: str) ->
 def test_the_demo_has_a_configuration(run: Callable) -> None:
     outcome = run("compare", "--config-name", "demo", "--cfg", "job")
     assert outcome.status == 0
-    assert OmegaConf.create(outcome.out).model.size == "nano"
+    cfg = OmegaConf.create(outcome.out)
+    assert cfg.reference == "zoo:motionlm-nano-sumo" and "model" not in cfg, "policies are made as their reference"
 
 
 @pytest.mark.parametrize(("size", "rate"), [("nano", 6e-3), ("paper", 4e-3)])

@@ -13,15 +13,18 @@ from dpa import zoo
 from dpa.training.checkpoint import load_policy, save_policy
 from recipes.common.cli import CONFIG
 from recipes.experiment.check import check_experiment
-from recipes.experiment.jobs import adopt, pretrain_job, reference_of
+from recipes.experiment.jobs import adopt, compared_policy, pretrain_job, reference_of
 
 NANO = "zoo:motionlm-nano-sumo"
 
 
 def configuration(*options: str) -> DictConfig:
-    given = ["model=nano", "model.context.max_pieces=256", *options]
+    return composed("model=nano", "model.context.max_pieces=256", *options)
+
+
+def composed(*options: str) -> DictConfig:
     with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):
-        return compose("compare", given)
+        return compose("compare", list(options))
 
 
 def test_the_reference_of_each_seed_is_the_policy_that_is_named(tmp_path: Path) -> None:
@@ -39,6 +42,20 @@ def test_seeds_may_have_references_of_their_own(tmp_path: Path) -> None:
     mine = save_policy(tmp_path / "mine.pt", weights, config, made)
     cfg = configuration(f"reference=['{NANO}',{mine}]", "seeds=[3,4]")
     assert reference_of(cfg, 3) == zoo.find("motionlm-nano-sumo") and reference_of(cfg, 4) == mine
+
+
+@pytest.mark.parametrize("name", zoo.names())
+def test_without_a_section_model_the_policies_are_made_as_their_reference(name: str) -> None:
+    cfg = composed("~model", f"reference=zoo:{name}", "seeds=[0]")
+    check_experiment(cfg)
+    assert compared_policy(cfg) == load_policy(zoo.find(name))[1]
+
+
+def test_references_of_two_shapes_are_refused_and_neither_model_nor_reference_as_well() -> None:
+    with pytest.raises(ValueError, match=r"zoo:smart-nano-sumo was made with other options than the first one"):
+        check_experiment(composed("~model", f"reference=['{NANO}','zoo:smart-nano-sumo']", "seeds=[0,1]"))
+    with pytest.raises(ValueError, match="no section model to train references of; say model=NAME, or reference=FILE"):
+        check_experiment(composed("~model"))
 
 
 @pytest.mark.parametrize(
@@ -68,11 +85,12 @@ def test_a_folder_of_another_reference_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_comparison_runs_from_a_reference_of_the_zoo(run: Callable, options: Callable, tmp_path: Path) -> None:
-    small = ["model.context.max_pieces=256", f"reference={NANO}", "seeds=[0]", "workers=1", "pictures.scenes=0"]
+    small = ["~model", f"reference={NANO}", "seeds=[0]", "workers=1", "pictures.scenes=0"]
     grid = ["decoding.grid=[[0.95,1.0]]", "decoding.num_rollouts=2", "alignment.snapshots=[]", "drift_rollouts=1"]
     fewer = [f"~{part}" for part in ("methods.sft_best_oa", "methods.sft_best_ade", "methods.adversarial_afd")]
     fewer += ["~experiment.setup.adversarial_afd", "experiment.checkpoints=last"]
-    outcome = run("compare", *options("compare", *small, *grid, *fewer, f"output={tmp_path}"))
+    command = [each for each in options("compare", *small, *grid, *fewer, f"output={tmp_path}") if each != "model=nano"]
+    outcome = run("compare", *command)
     assert outcome.status == 0, outcome.err
     assert "reference" in outcome.out and (tmp_path / "index.html").is_file()
     assert not (tmp_path / "seed_0/reference/checkpoints").exists(), "nothing was pre-trained"

@@ -46,7 +46,7 @@ from recipes.alignment.likelihoods import SIDED
 from recipes.alignment.losses import check_fit, make_loss
 from recipes.alignment.watch import Look, Watch
 from recipes.common.cli import CONFIG, plain
-from recipes.common.models import open_policy
+from recipes.common.models import episode_options, open_policy
 from recipes.common.partial import PartialResult
 from recipes.common.rolled import Rolled
 from recipes.common.scenes import open_splits
@@ -94,7 +94,7 @@ def test_tuning_scenes_without_a_token_to_predict_are_refused() -> None:
     with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):
         cfg = compose("pretrain", ["model=nano", "model.episode.control=predict"])
     with pytest.raises(ValueError, match="none of the 1 tuning scenes has a token to predict: .*control=predict"):
-        tuning_items(cfg, [scene], MotionLM("nano", VerletTokenizer()))
+        tuning_items(cfg, [scene], MotionLM("nano", VerletTokenizer()), episode_options(cfg.model))
 
 
 def test_the_weights_that_are_best_on_the_tuning_scenes_are_kept(runs: Path) -> None:

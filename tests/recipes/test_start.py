@@ -10,7 +10,7 @@ import torch
 
 from dpa.training.checkpoint import load_policy
 from dpa.training.loggers import read_curve
-from recipes.common.models import digest_of, open_policy
+from recipes.common.models import digest_of, open_policy, policy_file
 
 
 def elsewhere(options: Callable, stores: Path, start: object, output: Path, *more: str) -> list[str]:
@@ -82,6 +82,25 @@ def test_a_run_of_another_start_is_another_run(
     assert same.status == 0 and "step/s" not in same.err, "nothing is trained again"
     other = run("pretrain", *(option for option in command if "pretraining.start" not in option))
     assert other.status == 2 and "other options" in other.err
+
+
+def test_without_a_section_model_training_goes_on_with_the_policy_as_it_is_vocabulary_and_all(
+    run: Callable, options: Callable, stores: Path, tmp_path: Path
+) -> None:
+    start, told = "zoo:smart-nano-sumo", ["pretraining.steps=2", "pretraining.lr=1e-9", "~model"]
+    command = [each for each in elsewhere(options, stores, start, tmp_path, *told) if not each.startswith("model=")]
+    outcome = run("pretrain", *command)
+    assert outcome.status == 0, outcome.err
+    (weights, config, _), (before, made, _) = load_policy(tmp_path / "policy.pt"), load_policy(policy_file(start))
+    assert config == made
+    assert all(torch.allclose(weights[name], value, atol=1e-6) for name, value in before.items())
+
+
+def test_neither_a_section_model_nor_a_start_is_refused(run: Callable, options: Callable, tmp_path: Path) -> None:
+    command = [each for each in options("pretrain", f"output={tmp_path / 'run'}") if not each.startswith("model=")]
+    outcome = run("pretrain", *command, "~model")
+    assert outcome.status == 2 and "say model=NAME, or pretraining.start=FILE" in outcome.err, outcome.err
+    assert not (tmp_path / "run/checkpoints").exists()
 
 
 def test_what_a_policy_started_from_changes_nothing_about_how_it_is_opened(
