@@ -31,8 +31,7 @@ from dpa.realism.features import measure
 from dpa.realism.tracks import compare
 from dpa.report.statistics import Interval, summary
 from dpa.rollout import lifted
-from dpa.tokens import MotionTokenizer
-from envs.episode import EpisodeOptions, make_episode
+from envs.episode import EpisodeOptions
 from envs.files import write_json
 from envs.geometry.frames import to_world
 from envs.options import differences
@@ -41,29 +40,15 @@ from envs.scene import STEP_SECONDS, Scene, SceneSource, select_agents
 from envs.seeding import make_generator
 from recipes.common.cli import CONFIG, build, plain, recipe
 from recipes.common.models import open_policy, policies_of, weights_digest
-from recipes.common.rolled import driven
+from recipes.common.rolled import Rolls, driven, logs
 from recipes.common.scenes import fingerprint, open_splits
 from recipes.studies.rows import read_or_score
 from recipes.studies.tables import StudyTable, tell
 
-Rolls = Iterator[tuple[int, Tensor]]
-"""Index of a scene and its trajectories ``[R, A, 80, 4]``."""
 PLACES = ("single decisions", "alone", "among its own")
 """Where a policy is looked at."""
 SECONDS = (2.0, 8.0)
 """When it is looked at what has happened so far."""
-
-
-def logs(scenes: SceneSource, options: EpisodeOptions, tokenizer: MotionTokenizer | None) -> Rolls:
-    """The log of every scene; where a tokenizer is given, that of the self-driving car as its tokens have it."""
-    for index in range(len(scenes)):
-        scene = scenes[index]
-        episode = make_episode(scene, replace(options, control="sdc"))
-        poses = episode.logged
-        if tokenizer is not None:
-            tracks = tokenizer.encode_tracks(poses, episode.logged_valid, episode.recent, episode.kind)
-            poses = torch.where(episode.controlled[:, None, None], tracks.poses, poses)
-        yield index, lifted(scene, poses[None])
 
 
 def single_decisions(

@@ -53,10 +53,10 @@ def scores(measured: Features, config: RealismConfig) -> dict[str, Score]:
     }
     for name, indicator in config.indicators.items():
         if _EVENTS[name] in measured.values:
-            happened = _happened(measured, _EVENTS[name], config)
+            event = happened(measured, _EVENTS[name], config).any(-1)
             if name == "traffic_light_violation":
-                happened = happened & measured.vehicle
-            score = indicator_log_likelihood(happened[0], happened[1:], indicator)
+                event = event & measured.vehicle
+            score = indicator_log_likelihood(event[0], event[1:], indicator)
             found[name] = Score(score, torch.ones_like(score, dtype=torch.int64))
     return found
 
@@ -109,7 +109,7 @@ def _with_neighbours(valid: Tensor, differences: Differences) -> Tensor:
 def event_rates(measured: Features, config: RealismConfig) -> dict[str, Tensor]:
     """Share of rollouts and agents to which each event happened, ``[]`` each."""
     return {
-        name: _happened(measured, event, config)[1:].float().mean()
+        name: happened(measured, event, config).any(-1)[1:].float().mean()
         for name, event in _RATES.items()
         if event in measured.values
     }
@@ -134,14 +134,11 @@ def class_rates(measured: Features, config: RealismConfig) -> dict[str, float]:
         1.0
     """
     return {
-        name: _happened(measured, event, config)[1:, measured.kind == of].float().mean().item()
+        name: happened(measured, event, config).any(-1)[1:, measured.kind == of].float().mean().item()
         for name, (of, event) in _OF_CLASS.items()
     }
 
 
-def _happened(measured: Features, event: str, config: RealismConfig) -> Tensor:
-    """``[C, E]`` bool: the event happened at some step at which the agent is there in the log."""
-    happened = measured.values[event]
-    if Quirk.GHOSTS not in config.quirks:
-        happened = happened & measured.scored
-    return happened.any(-1)
+def happened(measured: Features, event: str, config: RealismConfig) -> Tensor:
+    """``[C, E, T]`` bool: the event happens at steps at which the agent is there in the log, as rates count it."""
+    return measured.values[event] & (measured.scored | (Quirk.GHOSTS in config.quirks))

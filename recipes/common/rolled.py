@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -13,10 +14,14 @@ from torch import Tensor
 from dpa.models import Decoding, MotionModel
 from dpa.preferences import PreferenceStore
 from dpa.rollout import lifted, make_collector, simulated_poses
+from dpa.tokens import MotionTokenizer
 from envs import keys
 from envs.episode import EpisodeOptions, make_episode
 from envs.scene import Scene, SceneSource
 from recipes.common.cli import build
+
+Rolls = Iterator[tuple[int, Tensor]]
+"""Index of a scene and its trajectories ``[R, A, 80, 4]``."""
 
 
 class Rolled(NamedTuple):
@@ -57,9 +62,19 @@ def rolled(
             yield Rolled(index, scene, trajectories, controlled[row, : trajectories.shape[1]])
 
 
-def driven(
-    scenes: SceneSource, model: MotionModel, options: EpisodeOptions, cfg: DictConfig
-) -> Iterator[tuple[int, Tensor]]:
+def logs(scenes: SceneSource, options: EpisodeOptions, tokenizer: MotionTokenizer | None) -> Rolls:
+    """The log of every scene; where a tokenizer is given, that of the self-driving car as its tokens have it."""
+    for index in range(len(scenes)):
+        scene = scenes[index]
+        episode = make_episode(scene, replace(options, control="sdc"))
+        poses = episode.logged
+        if tokenizer is not None:
+            tracks = tokenizer.encode_tracks(poses, episode.logged_valid, episode.recent, episode.kind)
+            poses = torch.where(episode.controlled[:, None, None], tracks.poses, poses)
+        yield index, lifted(scene, poses[None])
+
+
+def driven(scenes: SceneSource, model: MotionModel, options: EpisodeOptions, cfg: DictConfig) -> Rolls:
     """Index and trajectories ``[K, A, 80, 4]`` of every scene, driven by a model.
 
     Args:

@@ -53,6 +53,7 @@ SECTIONS = {
     "rerank": ("threads", "scenes"),
     "spread": ("threads", "scenes"),
     "ladder": ("threads", "scenes", "model"),
+    "encounters": ("threads", "scenes"),
     "gap": ("threads", "scenes"),
     "references": ("threads", "scenes", "collection.ranking", "evaluation"),
     "tokens": ("threads", "scenes", "model"),

@@ -22,7 +22,8 @@ from envs.scene import CURRENT_STEP, MapKind, Scene
 from envs.sources.synthetic import build_scene, straight_road
 from recipes.common.cli import CONFIG
 from recipes.common.models import build_policy, policy_config, write_policy
-from recipes.gap import PLACES, logs, look, single_decisions, tables
+from recipes.common.rolled import logs
+from recipes.gap import PLACES, look, single_decisions, tables
 
 METRIC = RealismConfig.load("2024")
 

@@ -25,10 +25,10 @@ from recipes.common.scenes import fingerprint, open_splits
 from recipes.studies.motions import MotionShelf
 
 RECIPES = (
-    "pretrain", "collect", "align", "evaluate", "play", "ladder", "gap", "references", "tokens", "compare", "validity",
-    "sensitivity",
+    "pretrain", "collect", "align", "evaluate", "play", "ladder", "gap", "encounters", "references", "tokens",
+    "compare", "validity", "sensitivity",
 )  # fmt: skip
-WITHOUT_POLICY = ("pretrain", "ladder", "gap", "references", "tokens", "compare", "play", "validity", "sensitivity")
+WITHOUT_POLICY = tuple(recipe for recipe in RECIPES if recipe not in ("collect", "align", "evaluate"))
 pytestmark = pytest.mark.usefixtures("stores")
 
 

@@ -1,0 +1,144 @@
+"""Who collides, and how they met: the first collision of every evaluated agent, by class.
+
+python -m recipes.encounters 'policies=[zoo:motionlm-nano-sumo,zoo:smart-nano-sumo]'
+
+With somebody beside them, ahead or behind, headed across or oncoming: what a collision rate sums up. Of several
+policies each is also told minus the first, scene by scene. Run the same command again to go on after a kill: policies
+that are there are read back.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any
+
+import hydra
+from omegaconf import DictConfig
+from torch import Tensor
+
+from dpa.realism import Encounter, RealismConfig, compare, encounters, measure
+from dpa.report.statistics import Interval, summary
+from envs.episode import EpisodeOptions
+from envs.files import write_json
+from envs.progress import progress
+from envs.scene import AgentKind, Scene, SceneSource
+from recipes.common.cli import CONFIG, plain, recipe
+from recipes.common.models import open_policy, policies_of, weights_digest
+from recipes.common.rolled import Rolls, driven, logs
+from recipes.common.scenes import fingerprint, open_splits
+from recipes.studies.rows import read_or_score
+from recipes.studies.tables import StudyTable, tell
+
+CLASSES = {AgentKind.VEHICLE: "vehicles", AgentKind.PEDESTRIAN: "pedestrians", AgentKind.CYCLIST: "cyclists"}
+MET = {
+    Encounter.BESIDE: "beside",
+    Encounter.IN_LINE: "ahead or behind",
+    Encounter.CROSSING: "crossing",
+    Encounter.ONCOMING: "oncoming",
+}
+ALL = "all"
+Figures = dict[str, dict[str, list[float | None]]]
+"""By class and by how they met, the share of each scene; None where nobody of the class is evaluated."""
+
+
+def look(scene: Scene, trajectories: Tensor, metric: RealismConfig) -> dict[str, dict[str, float | None]]:
+    """How the evaluated agents of each class met whom they collided with first.
+
+    Args:
+        scene: uncollated.
+        trajectories: ``[R, A, 80, 4]`` of the present agents.
+        metric: whose collisions these are.
+
+    Returns:
+        Shares of (rollout, agent) pairs, ``all`` of them summed; None where nobody of the class is evaluated.
+    """
+    comparison = compare(scene, trajectories, metric)
+    measured = measure([comparison], metric)[0]
+    met = encounters(comparison.tracks, measured, metric)[1:]
+    found: dict[str, dict[str, float | None]] = {}
+    for kind, name in CLASSES.items():
+        mine = met[:, measured.kind == kind]
+        shares = {told: (mine == how).float().mean().item() if mine.numel() else None for how, told in MET.items()}
+        found[name] = {ALL: (mine != Encounter.NONE).float().mean().item() if mine.numel() else None, **shares}
+    return found
+
+
+def score(scenes: SceneSource, roll: Callable[[SceneSource], Rolls], metric: RealismConfig, name: str) -> Figures:
+    """Each figure of :func:`look` as one value per scene."""
+    seen: dict[int, dict[str, dict[str, float | None]]] = {}
+    with progress(total=len(scenes), description=name, unit="scene") as bar:
+        for index, trajectories in roll(scenes):
+            seen[index] = look(scenes[index], trajectories, metric)
+            bar.update()
+    ordered = [seen[index] for index in sorted(seen)]
+    return {kind: {how: [each[kind][how] for each in ordered] for how in (ALL, *MET.values())} for kind in ordered[0]}
+
+
+def rows(cfg: DictConfig) -> Iterator[tuple[str, dict[str, Any], Callable[[SceneSource], Rolls]]]:
+    """Name of each row, what decides it, and its rollouts: the log, then the policies."""
+    yield "log", {}, lambda scenes: logs(scenes, EpisodeOptions(), None)
+    for name, path in policies_of(cfg).items():
+        model, options, config = open_policy(path, cfg.device)
+        told = {"policy": weights_digest(model), **config, "decoding": plain(cfg.decoding), "seed": cfg.seed}
+        yield name, told | {"num_rollouts": cfg.num_rollouts}, partial(driven, model=model, options=options, cfg=cfg)
+
+
+def measure_encounters(cfg: DictConfig, scenes: SceneSource) -> dict[str, Figures]:
+    """Score every row, or read it back.
+
+    Raises:
+        ValueError: a row was scored with other options.
+    """
+    metric = RealismConfig.load(str(cfg.metric))
+    common = {"scenes": fingerprint(scenes), "metric": metric.describe()}
+    return {
+        name: read_or_score(cfg.output, name, common | own, "figures", partial(score, scenes, roll, metric, name))
+        for name, own, roll in rows(cfg)
+    }
+
+
+def tables(found: dict[str, Figures], names: Sequence[str]) -> Iterator[StudyTable]:
+    """Of each class every row with intervals over scenes, and each further policy minus the first, scene by scene.
+
+    Args:
+        found: of :func:`measure_encounters`.
+        names: of the policies.
+    """
+    first, *others = names
+    columns = [ALL, *MET.values()]
+    for kind in CLASSES.values():
+        shares = {name: figures[kind] for name, figures in found.items()}
+        known = sum(value is not None for value in shares[first][ALL])
+        if not known:
+            continue
+        titles = [f"{kind} collide", *columns]
+        cells = {name: [_mean(each[column]) for column in columns] for name, each in shares.items()}
+        yield StudyTable(kind, f"{known} scenes with {kind}", titles, cells, signed=False)
+        if others:
+            less = {name: [_less(shares[name][each], shares[first][each]) for each in columns] for name in others}
+            yield StudyTable(f"{kind}_difference", f"minus {first}, scene by scene", titles, less)
+
+
+def _mean(values: Sequence[float | None]) -> Interval:
+    return summary([[value for value in values if value is not None]])
+
+
+def _less(values: Sequence[float | None], others: Sequence[float | None]) -> Interval:
+    return _mean([None if one is None else one - other for one, other in zip(values, others, strict=True)])
+
+
+@hydra.main(**CONFIG, config_name="encounters")
+@recipe
+def main(cfg: DictConfig) -> None:
+    """Entry point of ``python -m recipes.encounters``."""
+    scenes = open_splits(cfg.scenes)[cfg.split]
+    found = measure_encounters(cfg, scenes)
+    tell(cfg, list(tables(found, list(policies_of(cfg)))), {})
+    if cfg.json is not None:
+        write_json(cfg.json, {"scenes": len(scenes), "rows": found})
+
+
+if __name__ == "__main__":
+    sys.exit(main())
