@@ -70,6 +70,17 @@ class Mixture(NamedTuple):
         kappa = (sure[..., 0].clamp(max=math.log(most))).exp() + least
         return cls(weight.log_softmax(-1), UNIT * mean, softplus(spread) + LEAST_SCALE, kappa, before[..., 0])
 
+    def levelled(self) -> Tensor:
+        """The means, whose gradients are in units of :data:`UNIT` and not of the width of their density.
+
+        The log-density pulls at a mean with the inverse of its width: a density of a millimetre, as of straight driving
+        at one speed, a hundred times as strongly as that of a turn, which its noise would drown. (Seitzer et al., On
+        the Pitfalls of Heteroscedastic Uncertainty Estimation, ICLR 2022, with beta 1/2 of the variance.)
+        """
+        width = torch.cat((self.scale, self.kappa.rsqrt()[..., None]), -1).detach() / UNIT
+        fixed = self.mean.detach()
+        return fixed + width * (self.mean - fixed)
+
     def warmer(self, decoding: Decoding) -> Mixture:
         """That of a decoding: modes are cut, and with a temperature all densities are as much wider or narrower."""
         modes, t = decoding.log_probs(self.modes), decoding.temperature
@@ -150,7 +161,7 @@ class PatchMixture(Distribution):
 
     def _log_density(self, said: Mixture, patch: Tensor) -> Tensor:
         change = _changes(patch.unflatten(-1, (self.frames, 3)), said.before)[..., None, :, :]  # [*, 1, F, 3]
-        off = change - said.mean
+        off = change - said.levelled()
         laplace = -(off[..., :2].abs() / said.scale) - (2 * said.scale).log()
         mises = -2 * said.kappa * (off[..., 2] / 2).sin().square() - _log_bessel(said.kappa) - math.log(2 * math.pi)
         moves = (said.modes[..., :-1] + laplace.sum((-1, -2)) + mises.sum(-1)).logsumexp(-1)

@@ -132,6 +132,17 @@ def test_gradients_are_finite_where_agents_stand_and_where_densities_are_narrow(
     assert total.isfinite().all() and logits.grad.isfinite().all()
 
 
+def test_a_narrow_density_pulls_at_its_mean_no_more_than_a_wide_one() -> None:
+    """By hand: of a Laplace density with one over UNIT whatever its scale, where the inverse of the scale would."""
+    pulls = []
+    for width in (-6.0, 0.0):
+        logits = torch.tensor([0.0, -50.0, 0.0, 0.0, 0.0, width, width, 3.0, 0.0], dtype=torch.float64)
+        logits.requires_grad_()
+        PatchMixture(1).log_prob(logits, torch.tensor([0.5, 0.0, 0.0], dtype=torch.float64)).backward()
+        pulls.append(logits.grad[2].item())
+    assert pulls == pytest.approx([1.0, 1.0]), "of the number that the policy gives, UNIT of which is a metre"
+
+
 def test_a_nucleus_cuts_modes_and_a_temperature_narrows_them() -> None:
     mixture, logits = PatchMixture(2), torch.zeros(2 * 13 + 2, dtype=torch.float64)
     logits[0], logits[2] = 4.0, -20.0  # 98 % of the first mode, which goes 10 m further each step
