@@ -115,7 +115,7 @@ def main(cfg: DictConfig) -> None:
         for method, label in labels.items():
             gains[label][name] = gain_of(best, method)
         told = [gains[label][name] for label in labels.values()]
-        rows[name] = [*about(experiment, folder), float(len(experiment.seeds)), competence[name], *told]
+        rows[name] = [*about(experiment, folder), str(len(experiment.seeds)), competence[name], *told]
     output.mkdir(parents=True, exist_ok=True)
     plot_gains(competence, gains, output / "gains.png")
     columns = [
