@@ -106,14 +106,14 @@ def listed() -> Table:
     """All policies, with their measures on each set of scenes."""
     cards = {name: zoo.card(name) for name in zoo.names()}
     kinds = list(dict.fromkeys(kind for card in cards.values() for kind in card["measures"]))
-    table = Table("zoo:", "parameters", "hours", "tuning NLL", title="policies that come with the package")
+    table = Table("zoo:", "parameters", "hours", title="policies that come with the package")
     for kind in kinds:
         for measure in SHOWN:
             table.add_column(f"{kind}\n{measure.replace('_', ' ')}", justify="right")
     for name, card in cards.items():
         means = [card["measures"].get(kind, {}).get("mean", {}) for kind in kinds]
         cells = ["–" if mean.get(measure) is None else f"{mean[measure]:.3f}" for mean in means for measure in SHOWN]
-        table.add_row(name, f"{card['parameters']:,}", f"{card['hours']:.1f}", f"{card['tune_nll']:.3f}", *cells)
+        table.add_row(name, f"{card['parameters']:,}", f"{card['hours']:.1f}", *cells)
     return table
 
 

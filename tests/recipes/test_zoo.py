@@ -51,7 +51,7 @@ def test_a_name_opens_the_file_and_a_path_stays_a_path() -> None:
 def test_a_wrong_name_is_refused_with_the_nearest_one() -> None:
     with pytest.raises(ValueError, match="no policy 'motionlm-nan-sumo'; did you mean zoo:motionlm-nano-sumo"):
         policy_file("zoo:motionlm-nan-sumo")
-    with pytest.raises(ValueError, match="no policy '../secret'; It has motionlm"):
+    with pytest.raises(ValueError, match="no policy '../secret'; It has behaviorgpt-nano-sumo, motionlm"):
         policy_file("zoo:../secret")
 
 
