@@ -19,17 +19,15 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from dpa.realism import Encounter, RealismConfig, compare, encounters, measure
-from dpa.report.statistics import Interval, summary
 from envs.episode import EpisodeOptions
 from envs.files import write_json
-from envs.progress import progress
 from envs.scene import AgentKind, Scene, SceneSource
 from recipes.common.cli import CONFIG, plain, recipe
 from recipes.common.models import open_policy, policies_of, weights_digest
 from recipes.common.rolled import Rolls, driven, logs
 from recipes.common.scenes import fingerprint, open_splits
-from recipes.studies.rows import read_or_score
-from recipes.studies.tables import StudyTable, tell
+from recipes.studies.rows import looked_at, read_or_score
+from recipes.studies.tables import StudyTable, minus, over_scenes, tell
 
 CLASSES = {AgentKind.VEHICLE: "vehicles", AgentKind.PEDESTRIAN: "pedestrians", AgentKind.CYCLIST: "cyclists"}
 MET = {
@@ -67,12 +65,7 @@ def look(scene: Scene, trajectories: Tensor, metric: RealismConfig) -> dict[str,
 
 def score(scenes: SceneSource, roll: Callable[[SceneSource], Rolls], metric: RealismConfig, name: str) -> Figures:
     """Each figure of :func:`look` as one value per scene."""
-    seen: dict[int, dict[str, dict[str, float | None]]] = {}
-    with progress(total=len(scenes), description=name, unit="scene") as bar:
-        for index, trajectories in roll(scenes):
-            seen[index] = look(scenes[index], trajectories, metric)
-            bar.update()
-    ordered = [seen[index] for index in sorted(seen)]
+    ordered = looked_at(scenes, roll(scenes), partial(look, metric=metric), name)
     return {kind: {how: [each[kind][how] for each in ordered] for how in (ALL, *MET.values())} for kind in ordered[0]}
 
 
@@ -114,19 +107,14 @@ def tables(found: dict[str, Figures], names: Sequence[str]) -> Iterator[StudyTab
         if not known:
             continue
         titles = [f"{kind} collide", *columns]
-        cells = {name: [_mean(each[column]) for column in columns] for name, each in shares.items()}
+        cells = {name: [over_scenes(each[column]) for column in columns] for name, each in shares.items()}
         yield StudyTable(kind, f"{known} scenes with {kind}", titles, cells, signed=False)
         if others:
-            less = {name: [_less(shares[name][each], shares[first][each]) for each in columns] for name in others}
+            less = {
+                name: [over_scenes(minus(shares[name][each], shares[first][each])) for each in columns]
+                for name in others
+            }
             yield StudyTable(f"{kind}_difference", f"minus {first}, scene by scene", titles, less)
-
-
-def _mean(values: Sequence[float | None]) -> Interval:
-    return summary([[value for value in values if value is not None]])
-
-
-def _less(values: Sequence[float | None], others: Sequence[float | None]) -> Interval:
-    return _mean([None if one is None else one - other for one, other in zip(values, others, strict=True)])
 
 
 @hydra.main(**CONFIG, config_name="encounters")

@@ -29,21 +29,19 @@ from dpa.models import Decoding, MotionModel, collate_contexts, make_context
 from dpa.realism import RealismConfig
 from dpa.realism.features import measure
 from dpa.realism.tracks import compare
-from dpa.report.statistics import Interval, summary
 from dpa.rollout import lifted
 from envs.episode import EpisodeOptions
 from envs.files import write_json
 from envs.geometry.frames import to_world
 from envs.options import differences
-from envs.progress import progress
 from envs.scene import STEP_SECONDS, Scene, SceneSource, select_agents
 from envs.seeding import make_generator
 from recipes.common.cli import CONFIG, build, plain, recipe
 from recipes.common.models import open_policy, policies_of, weights_digest
 from recipes.common.rolled import Rolls, driven, logs
 from recipes.common.scenes import fingerprint, open_splits
-from recipes.studies.rows import read_or_score
-from recipes.studies.tables import StudyTable, tell
+from recipes.studies.rows import looked_at, read_or_score
+from recipes.studies.tables import StudyTable, minus, over_scenes, tell
 
 PLACES = ("single decisions", "alone", "among its own")
 """Where a policy is looked at."""
@@ -152,12 +150,7 @@ def score(
     scenes: SceneSource, roll: Callable[[SceneSource], Rolls], metric: RealismConfig, name: str
 ) -> dict[str, list[float | None]]:
     """Each figure of :func:`look` as one value per scene; None where the log has left by then."""
-    found: dict[int, dict[str, float]] = {}
-    with progress(total=len(scenes), description=name, unit="scene") as bar:
-        for index, trajectories in roll(scenes):
-            found[index] = look(scenes[index], trajectories, metric)
-            bar.update()
-    ordered = [found[index] for index in sorted(found)]
+    ordered = looked_at(scenes, roll(scenes), partial(look, metric=metric), name)
     return {key: [None if np.isnan(each[key]) else each[key] for each in ordered] for key in ordered[0]}
 
 
@@ -190,28 +183,18 @@ def tables(gap: dict[str, dict[str, list[float | None]]], names: Sequence[str], 
         num_scenes: of all.
     """
     columns = list(next(iter(gap.values())))
-    rows = {name: [_mean(figures[column]) for column in columns] for name, figures in gap.items()}
+    rows = {name: [over_scenes(figures[column]) for column in columns] for name, figures in gap.items()}
     title = f"the self-driving car in {num_scenes} scenes"
     found = [StudyTable("gap", title, ["driven by", *columns], rows, signed=False)]
     first, *others = names
     if others:
         pairs = {f"{name}: {place}": f"{first}: {place}" for name in others for place in PLACES}
         rows = {
-            row: [_mean(_minus(gap[row][column], gap[of_first][column])) for column in columns]
+            row: [over_scenes(minus(gap[row][column], gap[of_first][column])) for column in columns]
             for row, of_first in pairs.items()
         }
         found.append(StudyTable("gap_difference", f"minus {first}, scene by scene", ["driven by", *columns], rows))
     return found
-
-
-def _minus(values: list[float | None], others: list[float | None]) -> list[float | None]:
-    """Of the same scenes, in both of which the log is still there or has left."""
-    return [None if one is None else one - other for one, other in zip(values, others, strict=True)]
-
-
-def _mean(values: list[float | None]) -> Interval | None:
-    known = [value for value in values if value is not None]
-    return summary([known]) if known else None
 
 
 @hydra.main(**CONFIG, config_name="gap")

@@ -42,11 +42,10 @@ from envs.scene import SceneSource
 from envs.seeding import make_generator
 from recipes.common.cli import CONFIG, build, check_steps, deciding, finished, ranked_recipe
 from recipes.common.models import (
+    build_policy,
     check_written,
     digest_of,
-    episode_options,
     fresh_policy,
-    open_policy,
     policy_config,
     policy_file,
     write_policy,
@@ -84,8 +83,8 @@ def pretrain(
         ValueError: options that do not fit, or a folder with other options.
     """
     path, result, options = folder / "policy.pt", folder / "result.json", cfg.pretraining
-    seed_everything(seed)
-    model, episode, config = policy_to_train(cfg)
+    origin = None if options.start is None else Origin.open(options.start)
+    config = config_to_train(cfg, origin)
     decided_by = {
         "policy": config,
         "pretraining": deciding(options, *OBSERVING),
@@ -93,14 +92,14 @@ def pretrain(
         "scenes": fingerprint(splits.train),
         "tuning_scenes": fingerprint(splits.tune),
     }
-    origin = None if options.start is None else Origin.open(options.start)
     if origin is not None:
         decided_by["start"] = origin.digest
     if ranks.agree(finished(result, decided_by) is not None and path.is_file(), "finished =", folder):
         check_written(path)
         return path
-    device = ranks.place(cfg.device)
-    model = model.to(device)
+    seed_everything(seed)
+    device, episode = ranks.place(cfg.device), EpisodeOptions(**config["episode"])
+    model = (build_policy(config) if cfg.get("model") is None else fresh_policy(cfg.model)).to(device)
     if origin is not None:
         origin.load_into(model, config)
     best = copy.deepcopy(model)
@@ -161,18 +160,17 @@ def pretrain(
     return path
 
 
-def policy_to_train(cfg: DictConfig) -> tuple[MotionModel, EpisodeOptions, dict[str, Any]]:
-    """As ``model`` says, or without it that of ``pretraining.start``, with options of its episodes and configuration.
+def config_to_train(cfg: DictConfig, origin: Origin | None) -> dict[str, Any]:
+    """What decides the policy's shape: ``model``, or without it that of ``pretraining.start``.
 
     Raises:
         ValueError: there is neither.
     """
     if cfg.get("model") is not None:
-        return fresh_policy(cfg.model), episode_options(cfg.model), policy_config(cfg.model)
-    if cfg.pretraining.start is None:
+        return policy_config(cfg.model)
+    if origin is None:
         raise ValueError("there is no section model: say model=NAME, or pretraining.start=FILE to go on from a policy.")
-    model, *made = open_policy(cfg.pretraining.start)
-    return model.train(), *made
+    return origin.config
 
 
 def auxiliary_of(model: MotionModel, weight: float) -> dict[str, Auxiliary]:

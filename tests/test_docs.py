@@ -368,6 +368,13 @@ def experiment_of(config: dict[str, Any]) -> tuple[Any, ...]:
     return config["scenes"]["source"], config["experiment"]["name"], config["reference"]
 
 
+def model_of(references: list[str]) -> dict[str, Any]:
+    """The section ``model`` by which references of the zoo were made, the smaller MotionLM all of them."""
+    assert {name.partition("-sumo")[0] for name in references} == {"zoo:motionlm-nano"}
+    with initialize_config_dir(str(CONFIG), version_base="1.3"):
+        return OmegaConf.to_container(compose("reference").model)
+
+
 SINCE = re.compile(
     r"/(family|episode/\w+|tokenizer/(changes|reach)|auxiliary|context/(arrivals|control|decision_steps|horizon|max_controlled))"
 )
@@ -384,8 +391,7 @@ def test_the_study_beside_the_results_has_the_options_that_its_command_gives(stu
     for experiment in study.experiments.values():
         made = json.loads((study.folder / "experiments" / f"{experiment.name}.json").read_text())["config"]
         given = options_told(made)
-        if "model" in given:  # without, policies are made as their reference
-            assert told(made["model"]) == told(given["model"])
+        assert told(made["model"]) == told(given.get("model") or model_of(made["reference"])), "model"
         for name in ("seeds", "pretraining", "collection", "alignment", "evaluation", "decoding", "rankings"):
             assert told(made[name]) == told(given[name]), name
         for name in ("methods", "experiment", "aligned_scenes", "drift_rollouts", "device", "threads"):

@@ -61,13 +61,13 @@ def encounters(tracks: Tracks, measured: Features, config: RealismConfig) -> Ten
     hit = happened(measured, "collision_per_step", config)
     row, ego = hit.any(-1).nonzero(as_tuple=True)
     step = hit[row, ego].int().argmax(-1)
-    boxes = _boxes(tracks)[row, :, step]  # [N, A, 5]
-    there = tracks.valid[:, :, tracks.scored][row, :, step].clone()
-    own = boxes[torch.arange(len(row)), ego]
-    there[torch.arange(len(row)), ego] = False
+    boxes, there = tracks.boxes[row, step], tracks.valid[:, :, tracks.scored][row, :, step]  # [N, A, 5] and [N, A]
+    each = torch.arange(len(row), device=row.device)
+    own = boxes[each, ego]
+    there[each, ego] = False
     apart = signed_box_distance(own[:, None], boxes, config.corner_rounding)
-    other = boxes[torch.arange(len(row)), apart.where(there, torch.inf).argmin(-1)]
-    found = torch.zeros(hit.shape[:2], dtype=torch.int64)
+    other = boxes[each, apart.where(there, torch.inf).argmin(-1)]
+    found = torch.zeros_like(hit[..., 0], dtype=torch.int64)
     found[row, ego] = encounter_of(own, other)
     return found
 
@@ -95,9 +95,3 @@ def encounter_of(own: Tensor, other: Tensor) -> Tensor:
     same = torch.where(aside < along, Encounter.BESIDE, Encounter.IN_LINE)
     across = torch.where(turn > math.pi - ALIGNED, Encounter.ONCOMING, Encounter.CROSSING)
     return torch.where(turn < ALIGNED, same, across)
-
-
-def _boxes(tracks: Tracks) -> Tensor:
-    """``[C, A, T, 5]`` of the scored steps."""
-    pose = torch.cat((tracks.position[..., :2], tracks.heading[..., None]), -1)[:, :, tracks.scored]
-    return torch.cat((pose, tracks.extent[:, :, None, :2].expand(-1, -1, pose.shape[2], -1)), -1)

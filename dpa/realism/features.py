@@ -155,9 +155,7 @@ def _kinematics(tracks: Tracks, config: RealismConfig) -> dict[str, Tensor]:
 
 def _nearest_object(tracks: Tracks, rounding: float) -> Tensor:
     """Signed distance of the evaluated agents to the nearest other box (realism.md 3.1) -> ``[C, E, T]`` [m]."""
-    pose = torch.cat((tracks.position[..., :2], tracks.heading[..., None]), -1)[:, :, tracks.scored]
-    size = tracks.extent[:, :, None, :2].expand(-1, -1, pose.shape[2], -1)
-    boxes = torch.cat((pose, size), -1).transpose(1, 2)
+    boxes = tracks.boxes
     valid = tracks.valid[:, :, tracks.scored].transpose(1, 2)
     ego = torch.arange(tracks.num_ego, device=boxes.device)
     return nearest_box_distance(boxes, valid, ego, rounding).transpose(1, 2)

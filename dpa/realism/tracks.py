@@ -62,6 +62,13 @@ class Tracks:
         """The scored steps."""
         return slice(self.context, None)
 
+    @property
+    def boxes(self) -> Tensor:
+        """``[C, T, A, 5]`` x, y, heading, length, width at the scored steps."""
+        pose = torch.cat((self.position[..., :2], self.heading[..., None]), -1)[:, :, self.scored]
+        size = self.extent[:, :, None, :2].expand(-1, -1, pose.shape[2], -1)
+        return torch.cat((pose, size), -1).transpose(1, 2)
+
 
 class Comparison(NamedTuple):
     """One scene and rollouts of it, ready to be measured.

@@ -6,8 +6,33 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from envs.files import write_json
+from envs.progress import progress
+from envs.scene import Scene, SceneSource
 from recipes.common.cli import finished
+from recipes.common.rolled import Rolls
+
+Look = Callable[[Scene, Tensor], Any]
+"""What is told of a scene and its trajectories ``[R, A, 80, 4]``."""
+
+
+def looked_at(scenes: SceneSource, rolls: Rolls, look: Look, name: str) -> list[Any]:
+    """What is told of every scene, in their order.
+
+    Args:
+        scenes: that the rollouts are of.
+        rolls: their rollouts, in any order.
+        look: at one scene.
+        name: of the bar.
+    """
+    found: dict[int, Any] = {}
+    with progress(total=len(scenes), description=name, unit="scene") as bar:
+        for index, trajectories in rolls:
+            found[index] = look(scenes[index], trajectories)
+            bar.update()
+    return [found[index] for index in sorted(found)]
 
 
 def read_or_score(

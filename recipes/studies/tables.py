@@ -12,13 +12,34 @@ from omegaconf import DictConfig
 from rich import table as rich_table
 from rich.console import Console
 
-from dpa.report.statistics import Interval
+from dpa.report.statistics import Interval, summary
 from dpa.report.table import MISSING
 from dpa.training.loggers import make_logger
 from recipes.common.cli import plain
 
 Cell = float | Interval | str | None
 """A number, a mean with its interval, words, or None for what is not known."""
+
+
+def over_scenes(values: Sequence[float | None]) -> Interval | None:
+    """The mean over those scenes that have a value, with its interval; None where none has.
+
+    Examples:
+        >>> over_scenes([0.25, None, 0.75]).mean, over_scenes([None])
+        (0.5, None)
+    """
+    known = [value for value in values if value is not None]
+    return summary([known]) if known else None
+
+
+def minus(values: Sequence[float | None], others: Sequence[float | None]) -> list[float | None]:
+    """Scene by scene; in one that has no value neither has.
+
+    Examples:
+        >>> minus([0.75, None], [0.25, None])
+        [0.5, None]
+    """
+    return [None if one is None else one - other for one, other in zip(values, others, strict=True)]
 
 
 @dataclass(frozen=True)
