@@ -22,14 +22,13 @@ from dpa.realism import CLASS_RATES, RealismConfig, class_rates, realism
 from dpa.report.statistics import summary
 from dpa.training.seeding import seed_everything
 from envs.files import write_json
-from envs.progress import progress
 from envs.scene import Scene, SceneSource
 from envs.seeding import make_generator
 from recipes.common.cli import CONFIG, finite, mean_known, plain, recipe
 from recipes.common.models import episode_options, fresh_policy, open_policy, policies_of, policy_config, weights_digest
-from recipes.common.rolled import driven
+from recipes.common.rolled import Rolls, driven
 from recipes.common.scenes import fingerprint, open_splits
-from recipes.studies.rows import read_or_score
+from recipes.studies.rows import looked_at, read_or_score
 from recipes.studies.rungs import Rung, constant_velocity, logged, noisy_log, random_tokens, tokenized_log
 from recipes.studies.tables import StudyTable, tell
 
@@ -44,16 +43,14 @@ FIGURES = ("realism", "kinematic", "interactive", "map_based", *BESIDES)
 """What is kept of every scene."""
 
 
-def score_rung(
-    scenes: SceneSource, rollouts: Iterator[tuple[int, Tensor]], metrics: Mapping[str, RealismConfig], name: str
-) -> dict:
+def score_rung(scenes: SceneSource, rollouts: Rolls, metrics: Mapping[str, RealismConfig], name: str) -> dict:
     """``{year: {figure: one value per scene}}`` of one rung; None where a scene has none."""
-    found: dict[int, dict[str, dict[str, float]]] = {}
-    with progress(total=len(scenes), description=name, unit="scene") as bar:
-        for index, poses in rollouts:
-            found[index] = {year: _figures(scenes[index], poses, metric) for year, metric in metrics.items()}
-            bar.update()
-    return {year: {key: [finite(found[i][year][key]) for i in sorted(found)] for key in FIGURES} for year in metrics}
+
+    def figures(scene: Scene, poses: Tensor) -> dict[str, dict[str, float]]:
+        return {year: _figures(scene, poses, metric) for year, metric in metrics.items()}
+
+    found = looked_at(scenes, rollouts, figures, name)
+    return {year: {key: [finite(each[year][key]) for each in found] for key in FIGURES} for year in metrics}
 
 
 def _figures(scene: Scene, poses: Tensor, metric: RealismConfig) -> dict[str, float]:
@@ -61,13 +58,13 @@ def _figures(scene: Scene, poses: Tensor, metric: RealismConfig) -> dict[str, fl
     return result.as_dict() | class_rates(result.features, metric)
 
 
-def crude(scenes: SceneSource, rung: Rung, num_rollouts: int, seed: int) -> Iterator[tuple[int, Tensor]]:
+def crude(scenes: SceneSource, rung: Rung, num_rollouts: int, seed: int) -> Rolls:
     """Rollouts of every scene by a rung that needs no model."""
     for index in range(len(scenes)):
         yield index, rung(scenes[index], num_rollouts, make_generator(seed, "ladder", index))
 
 
-def rungs(cfg: DictConfig, scenes: SceneSource) -> Iterator[tuple[str, dict[str, Any], Iterator[tuple[int, Tensor]]]]:
+def rungs(cfg: DictConfig, scenes: SceneSource) -> Iterator[tuple[str, dict[str, Any], Rolls]]:
     """Name, what decides it, and rollouts of each rung, from the best to expect to the worst."""
     count, seed = cfg.num_rollouts, cfg.seed
     config = policy_config(cfg.model)
