@@ -41,7 +41,7 @@ from recipes.experiment.jobs import (
     trained_in,
 )
 from recipes.experiment.logged import log_experiment
-from recipes.experiment.methods import checkpoints_of, levels, policies_of, read_setups
+from recipes.experiment.methods import checkpoints_of, kept, levels, policies_of, read_setups
 from recipes.experiment.pictures import write_players
 from recipes.experiment.pool import Workers
 from recipes.experiment.runs import Run
@@ -56,6 +56,7 @@ def compare(cfg: DictConfig) -> dict[str, Any]:
     Raises:
         ValueError: options that do not fit, or other scenes than those of the folder, before any work.
     """
+    cfg = kept(cfg)
     check_experiment(cfg)
     splits, runs, made = open_splits(cfg.scenes), runs_of(cfg), provenance("compare", cfg.device)
     with alone_in(runs.root):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -155,6 +156,12 @@ def _check_rankings(cfg: DictConfig) -> None:
 
 
 def _check_methods(cfg: DictConfig, policy: dict[str, Any]) -> None:
+    for name, part in product(cfg.methods, ("data", "loss")):
+        if not OmegaConf.is_dict(cfg.methods[name].get(part)):
+            raise ValueError(
+                f"methods.{name}.{part} must be a section with kind and its options, got "
+                f"{cfg.methods[name].get(part)!r}; see the files of recipes/config/method."
+            )
     model = build_policy(policy)  # a loss is made to see its options refused
     for name, setup in read_setups(cfg).items():
         if unknown := sorted(set(cfg.methods[name]) - {"name", "data", "loss"}):
@@ -165,12 +172,6 @@ def _check_methods(cfg: DictConfig, policy: dict[str, Any]) -> None:
         if unknown := sorted(set(setup.alignment) - set(cfg.alignment)):
             raise ValueError(f"experiment.setup.{name}.alignment has no option {unknown[0]!r}.")
         alignment = setup.merged(cfg.alignment)
-        for part in ("data", "loss"):
-            if not OmegaConf.is_dict(cfg.methods[name].get(part)):
-                raise ValueError(
-                    f"methods.{name}.{part} must be a section with kind and its options, got "
-                    f"{cfg.methods[name].get(part)!r}; see the files of recipes/config/method."
-                )
         with told_of(f"methods.{name}"):
             check_fit(cfg.methods[name], alignment, cfg.collection.num_rollouts)
             data = check_data(cfg.methods[name].data, cfg.collection.num_rollouts)

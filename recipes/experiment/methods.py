@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from dpa.report.table import REFERENCE
 from envs.seeding import derive_seed
@@ -48,6 +49,33 @@ def setup_of(cfg: DictConfig, method: str) -> Setup:
     """The setup of one method."""
     given = cfg.experiment.setup.get(method)
     return build(Setup, OmegaConf.create({}) if given is None else given, f"experiment.setup.{method}")
+
+
+def kept(cfg: DictConfig) -> DictConfig:
+    """The configuration with the methods that ``only`` names, and what is said of them; all of it without ``only``.
+
+    Raises:
+        ValueError: ``only`` is no list of methods of the experiment.
+
+    Examples:
+        >>> given = {"only": ["sft"], "methods": {"omf": {}, "sft": {}}, "experiment": {"labels": {"omf": "OMF"}}}
+        >>> dict(kept(OmegaConf.create(given)).methods)
+        {'sft': {}}
+    """
+    if cfg.only is None:
+        return cfg
+    if not OmegaConf.is_list(cfg.only) or not cfg.only or not set(cfg.only) <= set(cfg.methods):
+        raise ValueError(
+            f"only must be methods of the experiment as in only=[{next(iter(cfg.methods))}], got {cfg.only!r}; there "
+            f"are {', '.join(cfg.methods)}."
+        )
+    cfg, others = copy.deepcopy(cfg), set(cfg.methods) - set(cfg.only)
+    told = (OmegaConf.select(cfg, f"experiment.{name}") for name in ("setup", "labels", "published", "axis.values"))
+    with open_dict(cfg):
+        for section in (cfg.methods, *(each for each in told if each is not None)):
+            for name in others & set(section):
+                del section[name]
+    return cfg
 
 
 def behind(cfg: DictConfig, policy: str) -> list[str]:

@@ -19,7 +19,7 @@ from recipes.compare import choose
 from recipes.experiment import jobs
 from recipes.experiment.check import check_experiment
 from recipes.experiment.jobs import runs_of
-from recipes.experiment.methods import drawing_seed, read_setups, setup_of, snapshots_of
+from recipes.experiment.methods import drawing_seed, kept, read_setups, setup_of, snapshots_of
 from recipes.experiment.pool import Workers
 from recipes.experiment.runs import Run
 from recipes.experiment.stages import Stages, alone_in, read_account
@@ -105,6 +105,34 @@ def test_every_experiment_fits_together(name: str) -> None:
     assert set((cfg.experiment.axis or {}).get("values", {})) <= set(cfg.methods)
     assert set(cfg.methods) <= set(cfg.experiment.labels)
     assert all(isinstance(label, str) for label in cfg.experiment.labels.values()), "a number needs quotes"
+
+
+def test_only_the_named_methods_are_run_and_told_of() -> None:
+    given = configuration(
+        "experiment=competent",
+        "only=[rloo,dpa_omf]",
+        "experiment.axis={name: rate, log: false, values: {rloo: 1, grpo: 2}}",
+    )
+    cfg = kept(given)
+    check_experiment(cfg)
+    assert list(cfg.methods) == ["dpa_omf", "rloo"] and list(cfg.experiment.setup) == ["rloo"]
+    assert set(cfg.experiment.labels) == {"reference", "dpa_omf", "rloo"} and set(cfg.experiment.published) == {
+        "reference",
+        "dpa_omf",
+    }
+    assert dict(cfg.experiment.axis["values"]) == {"rloo": 1}
+    assert cfg.methods.rloo == given.methods.rloo and cfg.experiment.setup.rloo == given.experiment.setup.rloo
+    assert kept(cfg) == cfg and "grpo" in given.methods
+    assert kept(configuration()) == configuration()
+
+
+@pytest.mark.parametrize("only", ["[dpa_omf,ppo]", "[]", "dpa_omf"])
+def test_only_is_refused_where_it_names_no_methods(only: str) -> None:
+    with pytest.raises(
+        ValueError,
+        match=r"only must be methods of the experiment as in only=\[dpa_omf\], got .*; there are dpa_omf, dpa_adef",
+    ):
+        kept(configuration(f"only={only}"))
 
 
 def test_a_method_comes_after_those_that_it_starts_from_or_learns_from() -> None:
