@@ -95,15 +95,16 @@ def plot_gains(
     """
     figure = blank_figure(7, 4.2)
     axes = figure.subplots()
+    ends = [end for at in competence.values() for end in (at.low, at.high)]
+    apart = 0.01 * (max(ends) - min(ends))  # methods stand side by side, so that one interval does not hide another
     for place, (color, (method, found)) in enumerate(zip(_colours(len(gains)), gains.items(), strict=True)):
         marker = MARKERS[place // len(CYCLE) % len(MARKERS)]
         for number, (name, gain) in enumerate(found.items()):
-            at = competence[name]
-            axes.plot([at.low, at.high], [gain.mean] * 2, color=color, lw=1.2, alpha=0.35)
-            axes.plot([at.mean] * 2, [gain.low, gain.high], color=color, lw=1.6, alpha=0.6)
-            label = None if number else method
-            axes.plot(at.mean, gain.mean, marker, color=color, ms=7, mec="white", mew=1, label=label)
+            at = competence[name].mean + apart * (place - (len(gains) - 1) / 2)
+            axes.plot([at] * 2, [gain.low, gain.high], color=color, lw=1.8)
+            axes.plot(at, gain.mean, marker, color=color, ms=7, mec="white", mew=1, label=None if number else method)
     for name, at in competence.items():
+        axes.plot([at.low, at.high], [0, 0], color=INK, lw=3, alpha=0.25)
         top = max(found[name].high for found in gains.values())
         axes.annotate(name, (at.mean, top), (0, 4), textcoords="offset points", ha="center", fontsize=7, color=INK)
     axes.axhline(0, color=QUIET, lw=1)
