@@ -7,8 +7,8 @@ Shapes are written with one alphabet everywhere:
 ``K``  rollouts of each scene; the K rollouts of a scene are contiguous
 ``B``  ``S * K`` rows of the vectorised environment
 ``A``  agents, padded to the largest scene of a batch, with a ``valid`` mask
-``T``  decisions of 0.5 s (16 in an episode)
-``F``  poses of 0.1 s inside one decision (5)
+``T``  decisions (of 0.5 s, 16 in an episode, by default)
+``F``  poses of 0.1 s inside one decision (5 by default)
 ``L``  logged steps of 0.1 s (91: ten of history, the current one, eighty to come)
 ``V``  motion tokens
 ``P``  polylines of a map
@@ -31,7 +31,7 @@ STEP: NestedKey = "step"
 """``[B, 1]`` int64: decisions taken so far in the episode."""
 AGENTS = "agents"
 RECENT: NestedKey = (AGENTS, "recent")
-"""``[B, A, F + 1, 3]``: poses of the last 0.5 s, the current one last."""
+"""``[B, A, F + 1, 3]``: poses of the last decision, the current one last."""
 VALID: NestedKey = (AGENTS, "valid")
 """``[B, A]`` bool: the agent exists now."""
 KIND: NestedKey = (AGENTS, "kind")

@@ -75,7 +75,7 @@ def align(
         ranks: that train together; the scenes of a step are theirs together.
         expert: folder of the store with the rollouts of an expert (``data.kind: expert``).
         watch: what is looked at every ``alignment.watch_interval`` steps, for the curves ``tune/*``. A method that
-            imitates is looked at as often, with or without it, for what a preference loss logs by itself.
+            imitates rollouts is looked at as often, with or without it, for what a preference loss logs by itself.
         among: indices of the scenes to learn from; by default all that the preferences are of.
         section: where ``method`` stands in the configuration of the command, for what is told of its options.
 

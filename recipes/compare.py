@@ -24,6 +24,7 @@ from dpa.models import Decoding
 from dpa.report.experiment import read_experiment, read_json
 from dpa.report.table import REFERENCE, print_table
 from envs.files import write_json
+from recipes.alignment.data import ON_POLICY
 from recipes.common.cli import CONFIG, recipe
 from recipes.common.provenance import merged, provenance
 from recipes.common.scenes import open_splits
@@ -99,7 +100,7 @@ def train_policies(cfg: DictConfig, stages: Stages) -> None:
     splits = sorted({"tune", cfg.experiment.split})
     stages.run("collect", collect_job, cfg, [(seed, split, REFERENCE) for seed in seeds for split in splits])
     for level in levels(setups):
-        needed = [setups[method] for method in level]
+        needed = [setups[method] for method in level if cfg.methods[method].data.kind not in ON_POLICY]
         sources = sorted({setup.start for setup in needed} | {setup.expert for setup in needed if setup.expert})
         stages.run("collect", collect_job, cfg, [(seed, "train", source) for seed in seeds for source in sources])
         again = sorted({(setup.start, setup.ranking) for setup in needed if setup.ranking is not None})

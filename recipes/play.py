@@ -109,8 +109,8 @@ def log_likelihood(batch: TensorDictBase, num_rollouts: int) -> Tensor:
         num_rollouts: K.
 
     Returns:
-        ``[S, K]`` log-probability of a token at temperature 1, mean over the tokens of controlled agents [nats]; NaN
-        where there are none.
+        ``[S, K]`` log-probability of a token at temperature 1 (of patches: log-density, the higher the more of its
+        agents move), mean over the tokens of controlled agents [nats]; NaN where there are none.
 
     Examples:
         >>> from dpa.models.motionlm import MotionLM

@@ -1,4 +1,4 @@
-"""Pre-train a MotionLM by next-token prediction on logged traffic (eq. 1 of the paper).
+"""Pre-train a policy by next-token prediction on logged traffic (eq. 1 of the paper).
 
     python -m recipes.pretrain                                   # SUMO scenes, made on the spot
     python -m recipes.pretrain scenes=gpudrive scenes.train=DIR scenes.eval=DIR output=runs/reference

@@ -108,7 +108,7 @@ class PreferenceLoss(LossModule):
     ``logit_mean``        mean of the logits of what is compared (:class:`Comparison`), ``logit_std`` their spread
     ``weight_mean``       mean of how strongly what is compared pulls, ``weight_std`` its spread
     ``saturated``         share of logits whose sigmoid is within :data:`SATURATED` of 0 or 1
-    ``pair_accuracy``     share of pairs whose preferred rollout is the more likely one
+    ``pair_accuracy``     share of pairs whose preferred rollout is the more likely one; NaN of densities
     ``nll_preferred``     negative log-likelihood per token [nats]; ``nll_unpreferred`` likewise
     ``entropy``           of the policy, per token [nats]
     ``kl``                of the policy from the reference, per token, whatever was drawn [nats]
@@ -194,6 +194,11 @@ class PreferenceLoss(LossModule):
         check_positive("alpha", alpha)
         check_choice("score_reduction", score_reduction, get_args(Reduction))
         check_not_negative("cloning", cloning)
+        if not reference and not distribution_of(actor_network).discrete:
+            raise ValueError(
+                "reference=false compares how likely rollouts are, and of densities that is mostly how many agents "
+                "move; say reference=true."
+            )
         hold_network(self, actor_network, keep_reference=True)
         self.alpha, self.reference = alpha, reference
         self.score_reduction, self.cloning = score_reduction, cloning
@@ -247,7 +252,8 @@ class PreferenceLoss(LossModule):
     def _pair_accuracy(self, preferred: Tensor, unpreferred: Tensor, valid: Tensor) -> Tensor:
         one, other = (reduce_tokens(side, valid, "sum") for side in (preferred, unpreferred))
         likelier = one > other if self.sides == "pairs" else one[:, :, None] > other[:, None]
-        return likelier.to(one.dtype).mean()
+        share = likelier.to(one.dtype).mean()
+        return share if distribution_of(self.actor_network).discrete else torch.full_like(share, torch.nan)
 
 
 def reduce_tokens(

@@ -157,6 +157,9 @@ class MotionModel(nn.Module, ABC):
 
         Args:
             compile: run what decodes through :func:`torch.compile`.
+
+        Raises:
+            ValueError: the family's decoding cannot be compiled, and is to be.
         """
 
     def auxiliary(self) -> Auxiliary | None:
@@ -166,6 +169,16 @@ class MotionModel(nn.Module, ABC):
     @abstractmethod
     def bytes_per_row(self) -> int:
         """Memory of one agent of one rollout while it runs: what is kept of it, and what a decision computes."""
+
+
+def refuse_compile(compile: bool, model: MotionModel) -> None:
+    """For a family whose decoding is not compiled.
+
+    Raises:
+        ValueError: it is to be.
+    """
+    if compile:
+        raise ValueError(f"compile=true: decoding of {type(model).__name__} is not compiled; say compile=false.")
 
 
 def named_size(config: Any, sizes: Mapping[str, Any]) -> Any:

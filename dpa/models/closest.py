@@ -68,6 +68,22 @@ class Follow:
         return (here - there).norm(dim=-1).mean(-1)
 
 
+def check_following(model: MotionModel, candidates: int, recovery: float) -> None:
+    """Refuse what a policy cannot follow a log by; see :class:`ClosestActor` for the arguments.
+
+    Raises:
+        ValueError: a policy without a vocabulary, or an option out of range.
+    """
+    if not model.distribution.discrete:
+        raise ValueError("CAT-K follows the log by a policy's own most probable tokens, and patches have none.")
+    if not 1 <= candidates <= model.tokenizer.vocab_size:
+        raise ValueError(
+            f"candidates must be 1 to {model.tokenizer.vocab_size}, the number of tokens, got {candidates}."
+        )
+    if not 0 < recovery <= 1:
+        raise ValueError(f"recovery must lie in (0, 1], got {recovery}.")
+
+
 class ClosestActor(MotionActor):
     """Follows a target by its own K most probable tokens, and says which token of all would be best.
 
@@ -111,14 +127,7 @@ class ClosestActor(MotionActor):
 
     def __init__(self, model: MotionModel, contexts: Contexts, *, candidates: int = 32, recovery: float = 1.0) -> None:
         super().__init__(model, contexts)
-        if not model.distribution.discrete:
-            raise ValueError("CAT-K follows the log by a policy's own most probable tokens, and patches have none.")
-        if not 1 <= candidates <= model.tokenizer.vocab_size:
-            raise ValueError(
-                f"candidates must be 1 to {model.tokenizer.vocab_size}, the number of tokens, got {candidates}."
-            )
-        if not 0 < recovery <= 1:
-            raise ValueError(f"recovery must lie in (0, 1], got {recovery}.")
+        check_following(model, candidates, recovery)
         self.candidates, self.recovery = candidates, recovery
         self.out_keys = [*self.out_keys, keys.LABEL, keys.LABEL_VALID]
 

@@ -54,13 +54,8 @@ class Distribution(ABC):
     def surprise(self, logits: Tensor, token: Tensor, label_smoothing: float = 0.0) -> Tensor:
         """``[*]``: what the next-token loss is the mean of, minus the log-probability [nats].
 
-        Raises:
-            ValueError: labels are to be smoothed over what has no vocabulary.
+        Labels are smoothed over a vocabulary; where there is none the loss refuses it.
         """
-        if label_smoothing:
-            raise ValueError(
-                f"label_smoothing={label_smoothing} needs a vocabulary to smooth over, and patches have none; set 0."
-            )
         return -self.log_prob(logits, token)
 
 

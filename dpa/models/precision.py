@@ -22,7 +22,7 @@ def check_precision(precision: str) -> Precision:
 
 
 def running_in(precision: Precision, device: torch.device) -> torch.autocast:
-    """Context in which linear layers run in a precision; attention, which holds places, stays in float32.
+    """Context in which linear layers run in a precision; attention that holds places stays in float32.
 
     Examples:
         >>> with running_in("bfloat16", torch.device("cpu")):

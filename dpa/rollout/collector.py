@@ -18,7 +18,7 @@ from dpa.models.precision import Precision
 from dpa.models.sampling import Decoding
 from dpa.rollout.crew import Crew, Outcome, Workers, hire
 from dpa.rollout.job import PostProcess, RolloutJob
-from dpa.rollout.plan import COLLECTED_BYTES, GIB, RolloutTask, plan_tasks
+from dpa.rollout.plan import GIB, RolloutTask, collected_bytes, plan_tasks
 from envs.episode import EpisodeOptions
 from envs.participants import num_simulated
 from envs.scene import SceneSource
@@ -301,7 +301,7 @@ def rows_within(memory: float, model: MotionModel) -> int:
     Raises:
         ValueError: the budget does not hold one agent.
     """
-    rows = int(memory * GIB) // (model.bytes_per_row() + model.config.horizon * COLLECTED_BYTES)
+    rows = int(memory * GIB) // (model.bytes_per_row() + collected_bytes(model.config.horizon, model.tokenizer.steps))
     if rows < 1:
         raise ValueError(f"memory must hold at least one agent, got {memory} GiB; give 0.1 or more.")
     return rows

@@ -8,8 +8,24 @@ from dataclasses import dataclass
 from dpa.training.batches import micro_batches
 
 GIB = 1 << 30
-COLLECTED_BYTES = 400
-"""Of one agent and decision in a collector's batch: recent poses (now and next), action, token, flags, reward."""
+COLLECTED_BYTES = 100, 60
+"""Of one agent and decision in a collector's batch: token, flags and reward; and of each of its poses: recent (now and
+next), action, and patches."""
+
+
+def collected_bytes(horizon: int, steps: int) -> int:
+    """Of one agent in a collector's batch of episodes.
+
+    Args:
+        horizon: T, decisions.
+        steps: F, poses of each.
+
+    Examples:
+        >>> collected_bytes(horizon=16, steps=5)
+        6400
+    """
+    decision, pose = COLLECTED_BYTES
+    return horizon * (decision + steps * pose)
 
 
 @dataclass(frozen=True)

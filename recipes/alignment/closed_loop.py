@@ -12,7 +12,7 @@ from torchrl.envs import TransformedEnv
 
 from dpa.losses.network import without_dropout
 from dpa.models import Contexts, MotionModel, collate_contexts
-from dpa.models.closest import ClosestActor
+from dpa.models.closest import ClosestActor, check_following
 from dpa.rollout.job import Subset, make_env
 from dpa.tokens import TokenAction
 from dpa.training.batches import ShuffledOrder, micro_batches
@@ -59,6 +59,7 @@ class ClosedLoopStep:
     ) -> None:
         self.model, self.loss, self.scenes = model, loss, scenes
         self.contexts = Contexts(scenes, model.featurize, episode)
+        check_following(model, **follow)
         self.follow, self.options, self.device, self.ranks = follow, options, device, ranks
         self.optimizer = make_optimizer(model, options.lr, options.weight_decay)
         self.schedule = make_schedule(self.optimizer, options.steps, options.warmup)

@@ -92,6 +92,8 @@ def probe(
         policy that has learnt nothing has 0.5), the negative log-likelihood per token [nats] of the demonstration, of
         the preferred and of the unpreferred rollouts, and along the rollouts the ``entropy`` and the ``kl`` from the
         reference per token [nats]. NaN where there is no token: then nothing is the likelier one.
+        NaN is also the ``pair_accuracy`` of densities: an agent that stands has a probability and one that moves a
+        density, so that a rollout's likelihood is mostly how many of its agents move.
     """
     return [_probed(model, reference, each, device) for each in probes]
 
@@ -112,7 +114,7 @@ def probe_sides(model: MotionModel, probes: Iterable[Probe], device: str = "cpu"
     for each in probes:
         context, tokens, valid = _rollouts(each, device)
         now = _log_prob(model, model(context, tokens, valid), tokens, valid)
-        found.append({name: value.item() for name, value in _sides(now, valid).items()})
+        found.append({name: value.item() for name, value in _sides(model, now, valid).items()})
     return found
 
 
@@ -127,10 +129,11 @@ def _log_prob(model: MotionModel, logits: Tensor, tokens: Tensor, valid: Tensor)
     return (model.distribution.log_prob(logits, tokens)[0] * valid[0]).sum((-1, -2))
 
 
-def _sides(now: Tensor, valid: Tensor) -> dict[str, Tensor]:
+def _sides(model: MotionModel, now: Tensor, valid: Tensor) -> dict[str, Tensor]:
     near, far = now.chunk(2)
+    likelier = _share_above(near, far, valid)
     return {
-        "pair_accuracy": _share_above(near, far, valid),
+        "pair_accuracy": likelier if model.distribution.discrete else torch.full_like(likelier, torch.nan),
         "nll_preferred": -near.mean() / valid.sum(),
         "nll_unpreferred": -far.mean() / valid.sum(),
     }
@@ -149,7 +152,7 @@ def _probed(model: MotionModel, reference: MotionModel, each: Probe, device: str
     near_gain, far_gain = (now - then).chunk(2)
     log_tokens, log_valid = (value[None, None].to(device) for value in (each.demonstration, each.demonstration_valid))
     log = model.distribution.log_prob(model(context, log_tokens, log_valid), log_tokens)
-    found = _sides(now, valid) | {
+    found = _sides(model, now, valid) | {
         "reward_accuracy": _share_above(near_gain, far_gain, valid, tie=0.5),
         "nll_demonstration": -log[log_valid].mean(),
         "entropy": _mean(model.distribution.entropy(logits), valid),

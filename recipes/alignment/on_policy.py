@@ -103,6 +103,7 @@ class OnPolicyStep:
         self.loss, self.device, self.ranks = loss, device, ranks
         self.contexts = Contexts(scenes, model.featurize, episode)
         self.passes, self.rewards = data.get("passes", 1), rewards_of(data)
+        self.tells_likelier = data.kind == "own_groups" and model.distribution.discrete
         self.optimizer = make_optimizer(model, options.lr, options.weight_decay)
         self.schedule = make_schedule(self.optimizer, self.passes * options.steps, self.passes * options.warmup)
         self.order = ShuffledOrder(len(scenes), options.scenes_per_step, seed)
@@ -202,7 +203,7 @@ class OnPolicyStep:
             "rollout_ade": float(ranked[keys.ADE].mean()),
             "rollout_spread": float((each * ranked[keys.SPREAD]).sum()),
             "staleness": float(one.staleness),
-            **({"rollout_pair_accuracy": self._accuracy(one)} if self.data.kind == "own_groups" else {}),
+            **({"rollout_pair_accuracy": self._accuracy(one)} if self.tells_likelier else {}),
             **{f"reward_{name}": float((each * value).sum()) for name, value in paid.items()},
         }
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-from numpy import nanmean
+from numpy import isnan, nanmean
 from omegaconf import DictConfig
 
 from dpa.losses.network import without_dropout
@@ -15,7 +15,7 @@ from dpa.models import Contexts, MotionModel
 from dpa.preferences import PreferenceStore, Provenance
 from envs.episode import EpisodeOptions
 from envs.store import SceneStore
-from recipes.alignment.likelihoods import PROBED, SIDED, make_probes, probe, probe_sides
+from recipes.alignment.likelihoods import make_probes, probe, probe_sides
 from recipes.common.models import open_policy
 from recipes.common.rankings import open_ranked_scenes
 
@@ -82,7 +82,7 @@ class Look:
         """Means over the scenes, as curves are named."""
         with without_dropout(self.model):
             found = probe(self.model, self.reference, self.probes, device)
-        return {f"tune/{name}": nanmean([each[name] for each in found]) for name in (*PROBED, "kl")}
+        return _means("tune", found)
 
 
 class ImitationLook:
@@ -123,4 +123,10 @@ class ImitationLook:
         """Means over the scenes, as curves are named."""
         with without_dropout(self.model):
             found = probe_sides(self.model, self.probes, device)
-        return {f"train/{name}": nanmean([each[name] for each in found]) for name in SIDED}
+        return _means("train", found)
+
+
+def _means(where: str, found: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Means over the scenes that have a figure, without figures that none has."""
+    figures = {name: [each[name] for each in found] for name in found[0]}
+    return {f"{where}/{name}": nanmean(each) for name, each in figures.items() if not isnan(each).all()}

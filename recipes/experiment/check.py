@@ -10,15 +10,17 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from dpa.losses import NextTokenLoss, token_network
 from dpa.models import Decoding
+from dpa.models.closest import check_following
 from dpa.ranking import PreferenceDistance
 from dpa.realism.config import RealismConfig
+from dpa.realism.tracks import HORIZON
 from dpa.report.experiment import REPORTED, read_experiment
 from dpa.report.table import REFERENCE
-from dpa.rewards import check_horizon
 from envs.episode import EpisodeOptions
 from envs.options import differences
-from recipes.alignment.data import check_data, rewards_of
+from recipes.alignment.data import check_data
 from recipes.alignment.losses import check_fit, make_loss
 from recipes.collect import check_collection
 from recipes.common.cli import check_steps, plain, told_of
@@ -162,7 +164,13 @@ def _check_methods(cfg: DictConfig, policy: dict[str, Any]) -> None:
                 f"methods.{name}.{part} must be a section with kind and its options, got "
                 f"{cfg.methods[name].get(part)!r}; see the files of recipes/config/method."
             )
-    model = build_policy(policy)  # a loss is made to see its options refused
+    model, steps = build_policy(policy), EpisodeOptions(**policy["episode"]).steps
+    if steps != HORIZON:
+        raise ValueError(
+            f"the metric is of {HORIZON} steps of 0.1 s, and these policies roll {steps} out; say model.episode."
+            f"horizon={HORIZON // policy['episode']['decision_steps']}, or take other references."
+        )
+    NextTokenLoss(token_network(model), label_smoothing=cfg.pretraining.label_smoothing)
     for name, setup in read_setups(cfg).items():
         if unknown := sorted(set(cfg.methods[name]) - {"name", "data", "loss"}):
             raise ValueError(
@@ -175,8 +183,9 @@ def _check_methods(cfg: DictConfig, policy: dict[str, Any]) -> None:
         with told_of(f"methods.{name}"):
             check_fit(cfg.methods[name], alignment, cfg.collection.num_rollouts)
             data = check_data(cfg.methods[name].data, cfg.collection.num_rollouts)
-            check_horizon(rewards_of(data), EpisodeOptions(**policy["episode"]).steps)
             make_loss(cfg.methods[name].loss, model)
+            if data.kind == "closed_loop":
+                check_following(model, data.candidates, data.recovery)
             check_steps(alignment, "alignment")
 
 

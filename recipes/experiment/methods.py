@@ -52,13 +52,16 @@ def setup_of(cfg: DictConfig, method: str) -> Setup:
 
 
 def kept(cfg: DictConfig) -> DictConfig:
-    """The configuration with the methods that ``only`` names, and what is said of them; all of it without ``only``.
+    """The configuration with the methods that ``only`` names and those that they need; all of it without ``only``.
+
+    What is said of the others goes as well. Where the headline does, the first that is named is it.
 
     Raises:
         ValueError: ``only`` is no list of methods of the experiment.
 
     Examples:
-        >>> given = {"only": ["sft"], "methods": {"omf": {}, "sft": {}}, "experiment": {"labels": {"omf": "OMF"}}}
+        >>> told = {"setup": {}, "labels": {"omf": "OMF"}}
+        >>> given = {"only": ["sft"], "methods": {"omf": {}, "sft": {}}, "experiment": told}
         >>> dict(kept(OmegaConf.create(given)).methods)
         {'sft': {}}
     """
@@ -69,12 +72,17 @@ def kept(cfg: DictConfig) -> DictConfig:
             f"only must be methods of the experiment as in only=[{next(iter(cfg.methods))}], got {cfg.only!r}; there "
             f"are {', '.join(cfg.methods)}."
         )
-    cfg, others = copy.deepcopy(cfg), set(cfg.methods) - set(cfg.only)
+    named, cfg = list(cfg.only), copy.deepcopy(cfg)
+    others = set(cfg.methods) - {each for name in named for each in behind(cfg, name)}
     told = (OmegaConf.select(cfg, f"experiment.{name}") for name in ("setup", "labels", "published", "axis.values"))
     with open_dict(cfg):
         for section in (cfg.methods, *(each for each in told if each is not None)):
             for name in others & set(section):
                 del section[name]
+    if cfg.experiment.get("headline") in others:
+        cfg.experiment.headline = named[0]
+    if cfg.experiment.get("versus") in others:
+        cfg.experiment.versus = None
     return cfg
 
 

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor, nn
 
 from dpa.models import make_context
+from dpa.models.behaviorgpt import BehaviorGPT
 from dpa.models.distribution import TOKENS
 from dpa.models.motionlm import MotionLM, SceneContext, featurize
-from dpa.tokens import VerletTokenizer
+from dpa.tokens import PatchTokenizer, VerletTokenizer
 from envs.episode import EpisodeOptions
 from envs.sources.synthetic import straight_road
 from recipes.alignment.likelihoods import SIDED, Probe, divergence, probe, probe_sides
@@ -64,6 +65,17 @@ def test_sides_alone_are_what_the_whole_probe_says_of_them(model: MotionLM) -> N
     asked = Probe(make_context(straight_road(2), featurize), near[0], valid, near, far, valid)
     (whole,), (sides,) = probe(model, model, [asked]), probe_sides(model, [asked])
     assert sides == {name: whole[name] for name in SIDED}
+
+
+def test_densities_tell_no_likelier_rollout() -> None:
+    """One that stands has a probability and one that moves a density; what is gained over a reference can be told."""
+    model = BehaviorGPT("nano", PatchTokenizer()).eval()
+    context = make_context(straight_road(2), model.featurize, EpisodeOptions(decision_steps=10, horizon=8))
+    patches, valid = 0.1 * torch.randn(3, 2, 8, 30), torch.ones(2, 8, dtype=torch.bool)
+    asked = Probe(context, patches[0], valid, patches[:1], torch.zeros_like(patches[:1]), valid)
+    (found,), (sides,) = probe(model, model, [asked]), probe_sides(model, [asked])
+    assert math.isnan(found["pair_accuracy"]) and math.isnan(sides["pair_accuracy"])
+    assert found["reward_accuracy"] == 0.5 and math.isfinite(found["nll_preferred"])
 
 
 def test_a_log_without_tokens_has_no_likelihood() -> None:

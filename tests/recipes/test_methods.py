@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 from dpa.models import Decoding
 from envs.files import write_json
 from recipes.common.cli import CONFIG
-from recipes.compare import choose
+from recipes.compare import choose, train_policies
 from recipes.experiment import jobs
 from recipes.experiment.check import check_experiment
 from recipes.experiment.jobs import runs_of
@@ -124,6 +124,32 @@ def test_only_the_named_methods_are_run_and_told_of() -> None:
     assert cfg.methods.rloo == given.methods.rloo and cfg.experiment.setup.rloo == given.experiment.setup.rloo
     assert kept(cfg) == cfg and "grpo" in given.methods
     assert kept(configuration()) == configuration()
+
+
+def test_only_brings_what_its_methods_need_and_tells_the_first_of_them() -> None:
+    cfg = kept(configuration("experiment=rounds", "only=[omf_round_2]"))
+    check_experiment(cfg)
+    assert list(cfg.methods) == ["dpa_omf", "omf_round_2"]
+    cfg = kept(configuration("experiment=competent", "only=[rloo_realism,cat_k]", "experiment.versus=grpo"))
+    check_experiment(cfg)
+    assert cfg.experiment.headline == "rloo_realism" and cfg.experiment.versus is None
+
+
+@pytest.mark.parametrize(("only", "rolled"), [("[rloo,cat_k]", []), ("[rloo,dpa_omf]", ["reference"])])
+def test_training_scenes_are_rolled_out_for_methods_that_read_them(only: str, rolled: list[str]) -> None:
+    jobs: list[tuple[str, list[tuple]]] = []
+    stages = SimpleNamespace(run=lambda stage, _, __, each: jobs.append((stage, each)))
+    train_policies(kept(configuration("experiment=competent", f"only={only}", "seeds=[0]")), stages)
+    collected = [each for stage, some in jobs if stage == "collect" for each in some]
+    assert [source for _, split, source in collected if split == "train"] == rolled
+    assert [method for stage, some in jobs if stage == "align" for _, method in some] == only.strip("[]").split(",")[
+        ::-1
+    ]
+
+
+def test_episodes_that_the_metric_cannot_score_are_refused_before_any_work() -> None:
+    with pytest.raises(ValueError, match=r"these policies roll 40 out; say model.episode.horizon=16"):
+        check_experiment(configuration("model.episode.horizon=8"))
 
 
 @pytest.mark.parametrize("only", ["[dpa_omf,ppo]", "[]", "dpa_omf"])

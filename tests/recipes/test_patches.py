@@ -9,10 +9,14 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
 
 from dpa.preferences import PreferenceStore
 from dpa.training.checkpoint import load_policy
 from envs import keys
+from recipes.common.cli import CONFIG
+from recipes.common.models import open_policy
+from recipes.experiment.check import check_experiment
 
 MODEL = "behaviorgpt_nano"
 
@@ -91,6 +95,28 @@ def test_an_option_that_needs_a_vocabulary_is_refused(
 ) -> None:
     outcome = run("pretrain", *options("pretrain", f"model={MODEL}", *told, f"output={tmp_path}"))
     assert outcome.status == 2 and message in outcome.err, outcome.err
+
+
+@pytest.mark.parametrize(
+    ("told", "message"),
+    [
+        ("experiment=baselines", "methods.cat_k: CAT-K follows the log by a policy's own most probable tokens"),
+        ("pretraining.label_smoothing=0.1", "label_smoothing=0.1 needs a vocabulary"),
+        ("methods.dpa_omf.loss.reference=false", "methods.dpa_omf: .*reference=false compares how likely rollouts are"),
+        ("methods.sft_best_oa.loss.label_smoothing=0.1", "methods.sft_best_oa: .*label_smoothing=0.1 needs a vocab"),
+    ],
+)
+def test_an_experiment_is_refused_before_any_work(told: str, message: str) -> None:
+    with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):
+        cfg = compose("compare", [f"model={MODEL}", told])
+    with pytest.raises(ValueError, match=message):
+        check_experiment(cfg)
+
+
+def test_decoding_that_cannot_be_compiled_is_refused(trained: SimpleNamespace) -> None:
+    model = open_policy(trained.policy)[0]
+    with pytest.raises(ValueError, match="compile=true: decoding of BehaviorGPT is not compiled; say compile=false"):
+        model.remember(compile=True)
 
 
 if __name__ == "__main__":

@@ -73,6 +73,7 @@ class Mixture(NamedTuple):
     def levelled(self) -> Tensor:
         """The means, whose gradients are in units of :data:`UNIT` and not of the width of their density.
 
+        Of density and divergence alike, so that what one pays for a mean the other can outweigh.
         The log-density pulls at a mean with the inverse of its width: a density of a millimetre, as of straight driving
         at one speed, a hundred times as strongly as that of a turn, which its noise would drown. (Seitzer et al., On
         the Pitfalls of Heteroscedastic Uncertainty Estimation, ICLR 2022, with beta 1/2 of the variance.)
@@ -128,9 +129,10 @@ class PatchMixture(Distribution):
     def divergence(self, logits: Tensor, reference: Tensor) -> Tensor:
         """See :meth:`~dpa.models.distribution.Distribution.divergence`; a bound from above, mode by mode."""
         one, other = (Mixture.of(each, self.frames) for each in (logits, reference))
-        apart, scale = (one.mean - other.mean)[..., :2].abs(), one.scale / other.scale
+        off = one.levelled() - other.mean
+        apart, scale = off[..., :2].abs(), one.scale / other.scale
         laplace = scale * (-apart / one.scale).exp() + apart / other.scale - 1 - scale.log()
-        turned = 2 * ((one.mean - other.mean)[..., 2] / 2).sin().square()  # 1 - cos
+        turned = 2 * (off[..., 2] / 2).sin().square()  # 1 - cos
         lost = _slack(one.kappa) / one.kappa  # 1 - I1 / I0
         mises = _log_bessel(other.kappa) - _log_bessel(one.kappa)
         mises = mises + (other.kappa - one.kappa) * lost + (1 - lost) * other.kappa * turned

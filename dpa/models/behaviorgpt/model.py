@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from dpa.models.base import named_size
-from dpa.models.behaviorgpt.mixture import PatchMixture
+from dpa.models.behaviorgpt.mixture import CELLS, PatchMixture
 from dpa.models.factorised import METRES, FactorisedConfig, FactorisedModel, NeighbourhoodOptions, mlp, quiet
 from dpa.tokens.base import MotionTokenizer
 from envs.geometry.frames import rotate, to_local
@@ -84,6 +84,17 @@ class BehaviorGPT(FactorisedModel):
         self.when, self.recur = nn.Embedding(tokenizer.steps, 3 * inner), nn.Linear(inner, 3 * inner)
         self.out = nn.Linear(inner, 6)
         self._calm()
+
+    def bytes_per_row(self) -> int:
+        """See :meth:`~dpa.models.base.MotionModel.bytes_per_row`: as many modes are unrolled, and one is drawn.
+
+        Examples:
+            >>> from dpa.tokens import PatchTokenizer
+            >>> round(BehaviorGPT("nano", PatchTokenizer()).bytes_per_row() / 1024)  # 64 measured
+            81
+        """
+        unrolled = self.config.modes * (6 * self.tokenizer.steps + 6 * self.config.frame_width)
+        return super().bytes_per_row() + 4 * (unrolled + 3 * CELLS * self.tokenizer.steps)
 
     @torch.no_grad()
     def _calm(self) -> None:

@@ -22,7 +22,7 @@ from dpa.models.motionlm import MotionLM, featurize
 from dpa.ranking.transform import RankRollouts
 from dpa.rollout import RolloutCollector, Workers, make_collector
 from dpa.rollout.collector import agents_of
-from dpa.rollout.plan import COLLECTED_BYTES, GIB
+from dpa.rollout.plan import GIB, collected_bytes
 from dpa.rollout.ray_crew import RayCrew
 from dpa.tokens import TokenAction
 from envs import keys
@@ -37,7 +37,7 @@ PROCESSES = Workers(2, "process")
 
 def budget(model: MotionLM, rows: int) -> float:
     """GiB for so many agents times rollouts."""
-    return (rows + 0.5) * (model.bytes_per_row() + model.config.horizon * COLLECTED_BYTES) / GIB
+    return (rows + 0.5) * (model.bytes_per_row() + collected_bytes(model.config.horizon, model.tokenizer.steps)) / GIB
 
 
 def tokens_of(batches: Iterable[TensorDictBase], num_rollouts: int) -> dict[int, Tensor]:

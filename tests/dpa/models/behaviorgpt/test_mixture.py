@@ -143,6 +143,19 @@ def test_a_narrow_density_pulls_at_its_mean_no_more_than_a_wide_one() -> None:
     assert pulls == pytest.approx([1.0, 1.0]), "of the number that the policy gives, UNIT of which is a metre"
 
 
+def test_divergence_pulls_at_a_mean_by_the_same_measure_as_the_density() -> None:
+    """What a KL term holds and what an objective pulls: both times the width over UNIT, at any width."""
+    for width in (-6.0, 0.0):
+        logits = torch.tensor([0.0, -50.0, 3.0, 0.0, 0.0, width, width, 3.0, 0.0], dtype=torch.float64)
+        logits.requires_grad_()
+        reference = logits.detach().clone()
+        reference[2] = 0.0
+        PatchMixture(1).divergence(logits, reference).backward()
+        scale = Mixture.of(reference, 1).scale[0, 0, 0].item()
+        true = (1 - math.exp(-3 * UNIT / scale)) / scale * UNIT  # of exp(-x/b) + x/b - 1, by the number, UNIT a metre
+        assert logits.grad[2].item() == pytest.approx(true * scale / UNIT, rel=1e-6)
+
+
 def test_a_nucleus_cuts_modes_and_a_temperature_narrows_them() -> None:
     mixture, logits = PatchMixture(2), torch.zeros(2 * 13 + 2, dtype=torch.float64)
     logits[0], logits[2] = 4.0, -20.0  # 98 % of the first mode, which goes 10 m further each step
