@@ -101,10 +101,7 @@ class NextTokenLoss(LossModule):
         super().__init__()
         if not 0 <= label_smoothing < 1:
             raise ValueError(f"label_smoothing must lie in [0, 1), got {label_smoothing}.")
-        if label_smoothing and not distribution_of(actor_network).discrete:
-            raise ValueError(
-                f"label_smoothing={label_smoothing} needs a vocabulary to smooth over, and patches have none; set 0."
-            )
+        distribution_of(actor_network).check_smoothing(label_smoothing)
         hold_network(self, actor_network, keep_reference=self.keeps_reference)
         self.label_smoothing = label_smoothing
         self.auxiliary, self.auxiliary_weight = auxiliary, auxiliary_weight

@@ -88,13 +88,13 @@ class MotionActor(TensorDictModuleBase):
         decoding: the distribution that tokens are drawn from; that of the model by default.
         seed: of the sampling.
         first_rollout: number of the first of the K rollouts, where others roll out the ones before.
-        precision: ``"bfloat16"`` runs linear layers in bfloat16 (autocast), for GPUs; attention, which holds places
-            relative to each other as differences of large numbers, stays in float32. ``"float32"`` is exact.
+        precision: ``"bfloat16"`` runs linear layers in bfloat16 (autocast), for GPUs; attention that holds places
+            relative to each other as differences of large numbers stays in float32. ``"float32"`` is exact.
         compile: run what decodes through :func:`torch.compile`: slow at first, for half a minute, then faster. It needs
             a C++ compiler. Values agree to float32's rounding.
 
     Raises:
-        ValueError: an unknown precision.
+        ValueError: an unknown precision, or a family whose decoding is not compiled, and is to be.
 
     ``log_prob`` is that of the model itself, ``sampling_log_prob`` that of the distribution drawn from (0 for the most
     probable token, which ``ExplorationType.DETERMINISTIC`` and ``MODE`` take).
@@ -130,6 +130,8 @@ class MotionActor(TensorDictModuleBase):
         self.model, self.contexts = model, contexts
         self.num_rollouts, self.first_rollout = num_rollouts, first_rollout
         self.decoding, self.precision = decoding or Decoding(top_p=1.0), check_precision(precision)
+        if compile and not model.compiles:
+            raise ValueError(f"compile=true: decoding of {type(model).__name__} is not compiled; say compile=false.")
         self._memory = model.remember(compile=compile)
         self._due: list[int] = []  # the decision that each row takes next
         self._last: Tensor | None = None  # [B, A, ...], tokens of the decision before

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -117,11 +117,13 @@ class MotionModel(nn.Module, ABC):
         tokenizer: what an action is.
         config: size of the model, a dataclass with ``horizon``.
         distribution: what the logits mean.
+        compiles: its memory can run what decodes through :func:`torch.compile`.
     """
 
     tokenizer: MotionTokenizer
     config: Any
     distribution: Distribution = TOKENS
+    compiles: ClassVar[bool] = False
 
     @property
     def no_token(self) -> int:
@@ -156,10 +158,7 @@ class MotionModel(nn.Module, ABC):
         """A memory of running rollouts.
 
         Args:
-            compile: run what decodes through :func:`torch.compile`.
-
-        Raises:
-            ValueError: the family's decoding cannot be compiled, and is to be.
+            compile: run what decodes through :func:`torch.compile`; asked of a family that :attr:`compiles` alone.
         """
 
     def auxiliary(self) -> Auxiliary | None:
@@ -169,16 +168,6 @@ class MotionModel(nn.Module, ABC):
     @abstractmethod
     def bytes_per_row(self) -> int:
         """Memory of one agent of one rollout while it runs: what is kept of it, and what a decision computes."""
-
-
-def refuse_compile(compile: bool, model: MotionModel) -> None:
-    """For a family whose decoding is not compiled.
-
-    Raises:
-        ValueError: it is to be.
-    """
-    if compile:
-        raise ValueError(f"compile=true: decoding of {type(model).__name__} is not compiled; say compile=false.")
 
 
 def named_size(config: Any, sizes: Mapping[str, Any]) -> Any:

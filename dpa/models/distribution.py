@@ -51,11 +51,24 @@ class Distribution(ABC):
             decoding: changes the distribution that is drawn from.
         """
 
+    def check_smoothing(self, label_smoothing: float) -> None:
+        """Refuse to smooth labels where there is no vocabulary.
+
+        Raises:
+            ValueError: they are to be.
+        """
+        if label_smoothing and not self.discrete:
+            raise ValueError(
+                f"label_smoothing={label_smoothing} needs a vocabulary to smooth over, and patches have none; set 0."
+            )
+
     def surprise(self, logits: Tensor, token: Tensor, label_smoothing: float = 0.0) -> Tensor:
         """``[*]``: what the next-token loss is the mean of, minus the log-probability [nats].
 
-        Labels are smoothed over a vocabulary; where there is none the loss refuses it.
+        Raises:
+            ValueError: see :meth:`check_smoothing`.
         """
+        self.check_smoothing(label_smoothing)
         return -self.log_prob(logits, token)
 
 

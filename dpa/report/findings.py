@@ -167,10 +167,10 @@ def _has_saturated(run: Path) -> bool:
 
 def ordering(experiment: Experiment) -> str:
     """Which methods can be told apart from ``experiment.versus``, each at its own best decoding."""
-    sides: dict[str, list[str]] = {side: [] for side in SAYS.values()}
     entries = experiment.own_best.versus
     if entries and all(entry["over"] == SCENES for entry in entries):
         return "no order is told: one training run of each says nothing about a method"
+    sides: dict[str, list[str]] = {side: [] for side in SAYS.values()}
     for entry in entries:
         sides[SAYS[verdict(entry["ci95"], entry["over"])]].append(experiment.labels[entry["method"]])
     told = ". ".join(f"{side}: {'; '.join(labels)}" for side, labels in sides.items() if labels)

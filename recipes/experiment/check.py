@@ -10,7 +10,6 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from dpa.losses import NextTokenLoss, token_network
 from dpa.models import Decoding
 from dpa.models.closest import check_following
 from dpa.ranking import PreferenceDistance
@@ -164,13 +163,14 @@ def _check_methods(cfg: DictConfig, policy: dict[str, Any]) -> None:
                 f"methods.{name}.{part} must be a section with kind and its options, got "
                 f"{cfg.methods[name].get(part)!r}; see the files of recipes/config/method."
             )
-    model, steps = build_policy(policy), EpisodeOptions(**policy["episode"]).steps
+    model = build_policy(policy)  # a loss is made to see its options refused
+    steps = EpisodeOptions(**policy["episode"]).steps
     if steps != HORIZON:
         raise ValueError(
             f"the metric is of {HORIZON} steps of 0.1 s, and these policies roll {steps} out; say model.episode."
             f"horizon={HORIZON // policy['episode']['decision_steps']}, or take other references."
         )
-    NextTokenLoss(token_network(model), label_smoothing=cfg.pretraining.label_smoothing)
+    model.distribution.check_smoothing(cfg.pretraining.label_smoothing)
     for name, setup in read_setups(cfg).items():
         if unknown := sorted(set(cfg.methods[name]) - {"name", "data", "loss"}):
             raise ValueError(

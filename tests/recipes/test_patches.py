@@ -11,6 +11,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
+from dpa.models import Contexts, MotionActor
 from dpa.preferences import PreferenceStore
 from dpa.training.checkpoint import load_policy
 from envs import keys
@@ -116,7 +117,7 @@ def test_an_experiment_is_refused_before_any_work(told: str, message: str) -> No
 def test_decoding_that_cannot_be_compiled_is_refused(trained: SimpleNamespace) -> None:
     model = open_policy(trained.policy)[0]
     with pytest.raises(ValueError, match="compile=true: decoding of BehaviorGPT is not compiled; say compile=false"):
-        model.remember(compile=True)
+        MotionActor(model, Contexts([], model.featurize), compile=True)
 
 
 if __name__ == "__main__":

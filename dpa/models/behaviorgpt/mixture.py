@@ -73,10 +73,11 @@ class Mixture(NamedTuple):
     def levelled(self) -> Tensor:
         """The means, whose gradients are in units of :data:`UNIT` and not of the width of their density.
 
-        Of density and divergence alike, so that what one pays for a mean the other can outweigh.
         The log-density pulls at a mean with the inverse of its width: a density of a millimetre, as of straight driving
         at one speed, a hundred times as strongly as that of a turn, which its noise would drown. (Seitzer et al., On
         the Pitfalls of Heteroscedastic Uncertainty Estimation, ICLR 2022, with beta 1/2 of the variance.)
+
+        Density and divergence read them alike, so that what one pays for a mean the other can outweigh.
         """
         width = torch.cat((self.scale, self.kappa.rsqrt()[..., None]), -1).detach() / UNIT
         fixed = self.mean.detach()

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from dpa.models.base import Choose, Decision, Memory, MotionModel, Observation, refuse_compile
+from dpa.models.base import Choose, Decision, Memory, MotionModel, Observation
 from dpa.models.context import Featurize
 from dpa.models.factorised.context import PIECE_POINTS, NeighbourhoodContext, NeighbourhoodOptions, featurize
 from dpa.models.factorised.edges import METRES, SECONDS, EdgeAttention, Edges, FourierEmbedding, relative
@@ -272,8 +272,7 @@ class FactorisedModel(MotionModel):
 
     # --- rollouts ---------------------------------------------------------------------------------------------------
     def remember(self, *, compile: bool = False) -> Memory:
-        """See :meth:`~dpa.models.base.MotionModel.remember`; nothing is compiled."""
-        refuse_compile(compile, self)
+        """See :meth:`~dpa.models.base.MotionModel.remember`."""
         return FactorisedMemory(self)
 
     def bytes_per_row(self) -> int:

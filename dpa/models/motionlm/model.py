@@ -73,6 +73,8 @@ class MotionLM(MotionModel):
         torch.Size([1, 3, 2, 16, 169])
     """
 
+    compiles = True
+
     def __init__(
         self, config: MotionLMConfig | str, tokenizer: MotionTokenizer, context: ContextOptions | None = None
     ) -> None:

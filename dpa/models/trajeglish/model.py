@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dpa.models.attention import GAZE
-from dpa.models.base import Memory, MotionModel, named_size, of_agents, refuse_compile
+from dpa.models.base import Memory, MotionModel, named_size, of_agents
 from dpa.models.context import Featurize
 from dpa.models.encoder import SceneEncoder, SceneMemory
 from dpa.models.forcing import Shown, shown_by
@@ -118,8 +118,7 @@ class Trajeglish(MotionModel):
         return Cast(*(value.repeat_interleave(rollouts, 0) for value in (order, *every, takes)))
 
     def remember(self, *, compile: bool = False) -> Memory:
-        """See :meth:`~dpa.models.base.MotionModel.remember`; nothing is compiled."""
-        refuse_compile(compile, self)
+        """See :meth:`~dpa.models.base.MotionModel.remember`."""
         return TurnMemory(self)
 
     def bytes_per_row(self) -> int:
