@@ -1,4 +1,4 @@
-"""Training batches of scenes: shuffled with locality, augmented, split over ranks and resumable to the batch.
+"""Training batches of scenes: shuffled with locality, prepared, split over ranks and resumable to the batch.
 
 What a batch holds is a pure function of the seed, the epoch and its place in the epoch. Neither ranks, workers nor
 interruptions change it.
@@ -19,15 +19,18 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from envs.augment import Augmentation
 from envs.scene import Scene, SceneSource, collate
 from envs.seeding import make_generator
 
 Key = tuple[int, list[int]]
 """What makes a batch: the epoch and the indices of its scenes."""
 Prepare = Callable[[Scene, torch.Generator], Any]
-UNCHANGED = Augmentation()
 OPEN_FILES = 1 << 16
+
+
+def as_it_is(scene: Scene, _generator: torch.Generator) -> Scene:
+    """The scene itself."""
+    return scene
 
 
 class SceneLoader:
@@ -46,8 +49,8 @@ class SceneLoader:
             ``scene_ids`` are used where it has them; otherwise it is one block, and only its size is checked on resume.
         batch_size: scenes of a batch of this rank.
         seed: of the order and of the generators.
-        prepare: called with each scene and a generator made from the seed, the epoch and the index of the scene: an
-            :class:`~envs.augment.Augmentation`, or whatever turns a scene into a training item.
+        prepare: called with each scene and a generator made from the seed, the epoch and the index of the scene:
+            whatever turns a scene into a training item.
         collate: called with what was prepared for a batch.
         rank: of this process.
         world_size: number of ranks.
@@ -63,7 +66,7 @@ class SceneLoader:
     Examples:
         >>> from envs.sources.synthetic import straight_road
         >>> scenes = [straight_road(2, seed=seed) for seed in range(6)]
-        >>> loader = SceneLoader(scenes, batch_size=2, prepare=Augmentation(mirror=0.5))
+        >>> loader = SceneLoader(scenes, batch_size=2)
         >>> for epoch in range(loader.epoch, 2):
         ...     print(epoch, [batch.agents.position.shape[0] for batch in loader])
         0 [2, 2, 2]
@@ -73,7 +76,7 @@ class SceneLoader:
 
         >>> batches = iter(loader)
         >>> first, state = next(batches), loader.state_dict()
-        >>> resumed = SceneLoader(scenes, batch_size=2, prepare=Augmentation(mirror=0.5))
+        >>> resumed = SceneLoader(scenes, batch_size=2)
         >>> resumed.load_state_dict(state)
         >>> next(iter(resumed)).scene_id == next(batches).scene_id
         True
@@ -85,7 +88,7 @@ class SceneLoader:
         batch_size: int = 64,
         *,
         seed: int = 0,
-        prepare: Prepare = UNCHANGED,
+        prepare: Prepare = as_it_is,
         collate: Callable[[list[Any]], Any] = collate,
         rank: int = 0,
         world_size: int = 1,

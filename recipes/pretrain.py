@@ -33,14 +33,13 @@ from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimiz
 from dpa.training.run import Run
 from dpa.training.seeding import seed_everything
 from envs import keys
-from envs.augment import Augmentation
 from envs.episode import EpisodeOptions
 from envs.files import write_json
 from envs.loader import SceneLoader
 from envs.progress import progress
 from envs.scene import SceneSource
 from envs.seeding import make_generator
-from recipes.common.cli import CONFIG, build, check_steps, deciding, finished, ranked_recipe
+from recipes.common.cli import CONFIG, check_steps, deciding, finished, ranked_recipe
 from recipes.common.models import (
     build_policy,
     check_written,
@@ -267,7 +266,7 @@ def training_items(
         model.tokenizer.on_cpu(),
         model.featurize,
         episode,
-        augment=build(Augmentation, options.augmentation, "pretraining.augmentation"),
+        mirror=options.mirror,
         noise=options.noise,
         recovery=options.recovery,
         max_agents=options.max_agents,

@@ -13,12 +13,11 @@ from dpa.models import make_context
 from dpa.models.context import Context, Featurize, keep_agents, num_bytes
 from dpa.tokens.base import MotionTokenizer
 from dpa.training.batches import Item, with_tokens
-from envs.augment import Augmentation, Change
 from envs.episode import EpisodeOptions
-from envs.scene import Scene, SceneSource
+from envs.mirror import mirror
+from envs.scene import SceneSource
 
 GIB = 1 << 30
-AS_LOGGED = Augmentation()
 
 
 def log_item(context: Context, tokenizer: MotionTokenizer) -> Item:
@@ -89,7 +88,7 @@ class LogItems:
     """The logs of scenes, for a :class:`~envs.loader.SceneLoader`: itself its scenes, with ``prepare`` and ``collate``.
 
     What a batch holds depends on the generators alone. A scene and its mirror image are cut up and tokenized when they
-    first come up, and kept in memory; rotated scenes and those without some agents are new each time, as noise is.
+    first come up, and kept in memory; noise is new each time.
 
     Args:
         scenes: a store or a list.
@@ -98,7 +97,7 @@ class LogItems:
         options: of their episodes.
 
     Keyword Args:
-        augment: drawn anew each time that a scene comes up.
+        mirror: probability of the mirror image, drawn anew each time that a scene comes up.
         noise: share of tokens that are replaced, drawn anew as well.
         recovery: share of the offset from the log that a label makes good after noise.
         max_agents: see :func:`choose_agents`.
@@ -122,18 +121,17 @@ class LogItems:
         featurize: Featurize,
         options: EpisodeOptions,
         *,
-        augment: Augmentation = AS_LOGGED,
+        mirror: float = 0.0,
         noise: float = 0.0,
         recovery: float = 1.0,
         max_agents: int,
         keep_gib: float = 0.0,
     ) -> None:
         self.scenes, self.tokenizer, self.featurize, self.options = scenes, tokenizer, featurize, options
-        self.augment, self.max_agents = augment, max_agents
+        self.mirror, self.max_agents = mirror, max_agents
         self.noise, self.recovery = noise, recovery
         self.keep_gib = keep_gib
         self._kept: dict[tuple[int, bool], Item] = {}
-        self._agents: dict[int, int] = {}
         self._bytes = 0
 
     def __len__(self) -> int:
@@ -150,13 +148,9 @@ class LogItems:
 
     def prepare(self, index: int, generator: torch.Generator) -> Drawn:
         """Draw for one scene."""
-        scene = None
-        if index not in self._agents:
-            scene = self.scenes[index]
-            self._agents[index] = len(scene.agents.sdc)
-        change = self.augment.draw(self._agents[index], generator)
-        key = (index, change.mirrored) if change.only_mirrors else None
-        log = self._kept[key] if key in self._kept else self._context(index, scene, change)
+        mirrored = bool(torch.rand((), generator=generator) < self.mirror)
+        key = (index, mirrored)
+        log = self._kept[key] if key in self._kept else self._context(index, mirrored)
         context = log.context if isinstance(log, Item) else log
         chosen = choose_agents(context, self.max_agents, generator)
         shape = (len(context.episode.kind if chosen is None else chosen), self.options.horizon, 3)
@@ -174,11 +168,12 @@ class LogItems:
             items = log_items(contexts, self.tokenizer, noise=self.noise, recovery=self.recovery, drawn=noise)
         return with_tokens(items)
 
-    def _context(self, index: int, scene: Scene | None, change: Change) -> Context:
-        return make_context(change(self.scenes[index] if scene is None else scene), self.featurize, self.options)
+    def _context(self, index: int, mirrored: bool) -> Context:
+        scene = self.scenes[index]
+        return make_context(mirror(scene) if mirrored else scene, self.featurize, self.options)
 
-    def _keep(self, key: tuple[int, bool] | None, item: Item) -> Item:
-        if key is not None and key not in self._kept and self._bytes < self.keep_gib * GIB:
+    def _keep(self, key: tuple[int, bool], item: Item) -> Item:
+        if key not in self._kept and self._bytes < self.keep_gib * GIB:
             # Tokens are rows of a whole batch, which would be kept with them.
             item = Item(item.context, *(value.clone() for value in item[1:]))
             self._kept[key] = item
@@ -187,7 +182,7 @@ class LogItems:
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what is kept: a worker of a loader keeps its own."""
-        return self.__dict__ | {"_kept": {}, "_agents": {}, "_bytes": 0}
+        return self.__dict__ | {"_kept": {}, "_bytes": 0}
 
 
 def choose_agents(context: Context, limit: int, generator: torch.Generator) -> Tensor | None:

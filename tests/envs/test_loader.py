@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Iterable, Sequence
 from itertools import chain, islice
 from pathlib import Path
@@ -14,21 +13,26 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.augment import Augmentation
 from envs.loader import SceneLoader, epoch_order
+from envs.mirror import mirror
 from envs.scene import Scene, SceneError
 from envs.sources.synthetic import straight_road
 from envs.store import SceneStore
 
-AUGMENT = Augmentation(rotation=math.pi, mirror=0.5, agent_drop=0.3)
+
+def changed(scene: Scene, generator: torch.Generator) -> Scene:
+    """Mirrored or not, and moved by what was drawn for it."""
+    flip, far = torch.rand(2, generator=generator).tolist()
+    scene = mirror(scene) if flip < 0.5 else scene.clone()
+    scene.agents.position[..., 0] += far
+    return scene
 
 
 def make_scenes(count: int) -> list[Scene]:
-    """Scenes of different sizes whose other agents may be dropped."""
+    """Scenes of different sizes."""
     scenes = []
     for number in range(count):
         scene = straight_road(2 + number % 3, seed=number)
-        scene.agents.predict[:] = False
         scene.scene_id = f"scene_{number}"
         scenes.append(scene)
     return scenes
@@ -144,9 +148,9 @@ def test_the_last_batch_is_dropped_or_filled_up_from_the_start_of_the_epoch() ->
 @pytest.mark.parametrize("drop_last", [True, False])
 @pytest.mark.parametrize("world_size", [2, 3, 6])
 def test_a_global_batch_has_the_same_scenes_on_any_number_of_ranks(world_size: int, drop_last: bool) -> None:
-    alone = SceneLoader(IN_BLOCKS, 6, prepare=AUGMENT, drop_last=drop_last)
+    alone = SceneLoader(IN_BLOCKS, 6, prepare=changed, drop_last=drop_last)
     ranks = [
-        SceneLoader(IN_BLOCKS, 6 // world_size, prepare=AUGMENT, rank=rank, world_size=world_size, drop_last=drop_last)
+        SceneLoader(IN_BLOCKS, 6 // world_size, prepare=changed, rank=rank, world_size=world_size, drop_last=drop_last)
         for rank in range(world_size)
     ]
     assert {len(rank) for rank in ranks} == {len(alone)}
@@ -166,12 +170,12 @@ def one_by_one(batch: Scene) -> list[tuple]:
     ]
 
 
-# --- augmentation ---------------------------------------------------------------------------------------------------
+# --- prepared scenes ------------------------------------------------------------------------------------------------
 
 
-def test_augmentation_depends_on_scene_and_epoch_and_not_on_the_batch() -> None:
+def test_what_is_drawn_depends_on_scene_and_epoch_and_not_on_the_batch() -> None:
     def shown(batch_size: int, window: int) -> list[dict[str, tuple]]:
-        loader = SceneLoader(IN_BLOCKS, batch_size, prepare=AUGMENT, block_window=window, drop_last=False)
+        loader = SceneLoader(IN_BLOCKS, batch_size, prepare=changed, block_window=window, drop_last=False)
         return [{s[0]: s for batch in loader for s in one_by_one(batch)} for _ in range(2)]
 
     first, second = shown(4, 2), shown(9, 6)
@@ -181,9 +185,9 @@ def test_augmentation_depends_on_scene_and_epoch_and_not_on_the_batch() -> None:
     assert all(first[0][name] != plain[name] for name in plain)
 
 
-def test_without_augmentation_scenes_come_as_they_are_and_the_source_stays() -> None:
+def test_by_default_scenes_come_as_they_are_and_the_source_stays() -> None:
     before = [scene.clone() for scene in SCENES]
-    list(SceneLoader(SCENES, 23, prepare=AUGMENT))
+    list(SceneLoader(SCENES, 23, prepare=changed))
     (batch,) = SceneLoader(SCENES, 23)
     for row, name in enumerate(batch.scene_id):
         scene = before[int(name.removeprefix("scene_"))]
@@ -194,7 +198,7 @@ def test_without_augmentation_scenes_come_as_they_are_and_the_source_stays() -> 
 
 def test_the_global_generator_is_left_alone() -> None:
     before = torch.get_rng_state()
-    list(SceneLoader(SCENES, 4, prepare=AUGMENT))
+    list(SceneLoader(SCENES, 4, prepare=changed))
     assert torch.equal(torch.get_rng_state(), before)
 
 
@@ -202,7 +206,7 @@ def test_the_global_generator_is_left_alone() -> None:
 
 
 def make_loader(**options: Any) -> SceneLoader:
-    return SceneLoader(IN_BLOCKS, **{"batch_size": 4, "seed": 3, "prepare": AUGMENT, **options})
+    return SceneLoader(IN_BLOCKS, **{"batch_size": 4, "seed": 3, "prepare": changed, **options})
 
 
 @pytest.mark.parametrize("drop_last", [True, False])
@@ -325,12 +329,12 @@ def store(write_store: Callable[[Path, list[Scene]], Path], tmp_path: Path) -> S
 
 
 def test_workers_change_nothing_and_the_state_counts_what_was_handed_out(store: SceneStore) -> None:
-    here = SceneLoader(store, 4, prepare=AUGMENT)
+    here = SceneLoader(store, 4, prepare=changed)
     expected = contents(islice(here.endless(), 10))
-    loader = SceneLoader(store, 4, prepare=AUGMENT, workers=1)
+    loader = SceneLoader(store, 4, prepare=changed, workers=1)
     before = torch.get_rng_state()
     got = contents(islice(loader, 2))  # left while the worker has loaded ahead
-    resumed = SceneLoader(store, 4, prepare=AUGMENT)
+    resumed = SceneLoader(store, 4, prepare=changed)
     resumed.load_state_dict(loader.state_dict())
     assert contents(resumed) == expected[2:5]
     older = iter(loader)

@@ -40,7 +40,7 @@ METHODS = {
 }
 SPLIT = "max_rows=4"
 """Several parts in a step, and not as many on each rank."""
-PRETRAIN = ("pretraining.batch_size=4", f"pretraining.{SPLIT}", "pretraining.augmentation.mirror=0.5")
+PRETRAIN = ("pretraining.batch_size=4", f"pretraining.{SPLIT}", "pretraining.mirror=0.5")
 SHORT = ("pretraining.steps=10", "pretraining.tune_interval=5", "pretraining.checkpoint_interval=5")
 LONG = ("pretraining.steps=50", "pretraining.warmup=5", "pretraining.tune_interval=25", "pretraining.lr=1e-3")
 ALIGN_LONG = ("alignment.steps=50", "alignment.scenes_per_step=4", "alignment.pairs_per_scene=2", "alignment.lr=1e-4")

@@ -13,7 +13,6 @@ from dpa.models.motionlm import featurize
 from dpa.tokens import VerletTokenizer
 from dpa.training.batches import Item
 from dpa.training.logs import LogItems, choose_agents, log_item, log_items
-from envs.augment import Augmentation
 from envs.episode import Episode, EpisodeOptions
 from envs.loader import SceneLoader
 from envs.scene import Scene
@@ -106,12 +105,10 @@ def test_a_cropped_item_is_the_log_of_the_agents_that_are_left() -> None:
 @pytest.mark.parametrize(
     "options",
     [
-        {"augment": Augmentation(mirror=0.5)},
-        {"augment": Augmentation(mirror=0.5, rotation=1.0)},
-        {"augment": Augmentation(mirror=0.5, agent_drop=0.3)},
-        {"augment": Augmentation(mirror=0.5), "noise": 0.3},
+        {"mirror": 0.5},
+        {"mirror": 0.5, "noise": 0.3},
     ],
-    ids=["mirror", "rotation", "dropped agents", "noise"],
+    ids=["mirror", "noise"],
 )
 def test_what_is_kept_is_what_would_be_made_anew(options: dict[str, object]) -> None:
     kept, anew = shown(logs(keep_gib=1.0, **options), range(6)), shown(logs(**options), range(6))
@@ -151,7 +148,7 @@ def test_a_worker_gets_the_scenes_and_not_what_is_kept() -> None:
 
 # --- through a loader -----------------------------------------------------------------------------------------------
 def test_a_log_is_drawn_as_the_generator_says() -> None:
-    made = logs([SCENES[1]], augment=Augmentation(mirror=0.5), noise=0.5)
+    made = logs([SCENES[1]], mirror=0.5, noise=0.5)
     items = [one for (one,) in shown(made, [0, 0, 1, 2, 3, 4])]
     assert all(one.tokens.shape == (1, 4, 16) for one in items)
     assert torch.equal(items[0].tokens, items[1].tokens) and torch.equal(items[0].labels, items[1].labels)
