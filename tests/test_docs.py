@@ -38,6 +38,7 @@ from recipes.alignment.losses import LOSSES
 from recipes.benchmark.__main__ import make_parser as benchmark_parser
 from recipes.common.models import TOKENIZERS
 from recipes.difference import make_parser as difference_parser
+from recipes.experiment.methods import kept
 from recipes.plan import make_parser as plan_parser
 from recipes.report import make_parser as report_parser
 from recipes.studies import spurious
@@ -358,7 +359,7 @@ def options_told(made: dict[str, Any]) -> dict[str, Any]:
     """The configuration of the command by which the pages of results run an experiment from its references."""
     commands = re.findall(r"^ +python -m recipes.compare --config-name driving (.*)$", results(), re.MULTILINE)
     with initialize_config_dir(str(CONFIG), version_base="1.3"):
-        composed = [compose("driving", shlex.split(options)) for options in commands]
+        composed = [kept(compose("driving", shlex.split(options))) for options in commands]
     composed = [OmegaConf.to_container(each, resolve=True) for each in composed]
     (found,) = [each for each in composed if experiment_of(each) == experiment_of(made)]
     return found
@@ -376,9 +377,10 @@ def model_of(references: list[str]) -> dict[str, Any]:
 
 
 SINCE = re.compile(
-    r"/(family|episode/\w+|tokenizer/(changes|reach)|auxiliary|context/(arrivals|control|decision_steps|horizon|max_controlled))"
+    r"/(family|episode/\w+|tokenizer/(changes|reach)|auxiliary|context/(arrivals|control|decision_steps|horizon|max_controlled)"
+    r"|augmentation/(rotation|agent_drop))"
 )
-"""Options that came, or moved from the context to the episode, after studies beside the results were made."""
+"""Options that came or went, or moved from the context to the episode, after studies beside the results were made."""
 
 
 @pytest.mark.slow
@@ -386,7 +388,8 @@ def test_the_study_beside_the_results_has_the_options_that_its_command_gives(stu
     """Of all that decides a result; where scenes are kept, and what was shown, may differ."""
 
     def told(value: Any) -> dict[str, Any]:
-        return {place: leaf for place, leaf in leaves(value).items() if not SINCE.fullmatch(place)}
+        since = {place: leaf for place, leaf in leaves(value).items() if not SINCE.fullmatch(place)}
+        return {place.replace("/augmentation/mirror", "/mirror"): leaf for place, leaf in since.items()}
 
     for experiment in study.experiments.values():
         made = json.loads((study.folder / "experiments" / f"{experiment.name}.json").read_text())["config"]
