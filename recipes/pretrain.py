@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from dpa.losses import NextTokenLoss, token_network
 from dpa.models import MotionModel
 from dpa.models.base import Auxiliary
+from dpa.models.contract import check_contract
 from dpa.training.batches import Item, collate_items, micro_batches
 from dpa.training.checkpoint import load_policy, load_weights
 from dpa.training.distributed import ALONE, Ranks, join_ranks
@@ -99,7 +100,9 @@ def pretrain(
     seed_everything(seed)
     device, episode = ranks.place(cfg.device), EpisodeOptions(**config["episode"])
     model = (build_policy(config) if cfg.get("model") is None else fresh_policy(cfg.model)).to(device)
-    if origin is not None:
+    if origin is None:
+        check_contract(model)
+    else:
         origin.load_into(model, config)
     best = copy.deepcopy(model)
     train = training_items(cfg, splits.train, model, episode, seed, ranks)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
@@ -45,12 +46,15 @@ def make_card(run: Path, evaluations: dict[str, Path]) -> dict[str, Any]:
         evaluations: results of :mod:`recipes.evaluate` by a name for their scenes.
 
     Raises:
-        ValueError: it is not finished, has learnt from scenes with a licence, or a result is of another policy.
+        ValueError: it is not finished, was aligned, has learnt from scenes with a licence, or a result is of another
+            policy.
     """
     file = run / zoo.POLICY
     if not file.is_file():
         raise ValueError(f"{run} holds no {zoo.POLICY}; run recipes.pretrain to its end first.")
     weights, config, made = load_policy(file)
+    if made["method"] != "reference":
+        raise ValueError(f"{file} was aligned by {made['method']}; the zoo takes policies of recipes.pretrain alone.")
     for source in sources(made):
         if source not in FREE_SOURCES:
             raise ValueError(
@@ -88,15 +92,21 @@ def _measures(path: Path, digest: str) -> dict[str, Any]:
 
 
 def add(name: str, run: Path, evaluations: dict[str, Path], folder: Path = zoo.FOLDER) -> Path:
-    """Put a policy into the zoo, in the place of one of the same name.
+    """Put a policy into the zoo.
 
     Returns:
         Its folder.
+
+    Raises:
+        ValueError: a name that is none or is taken, or see :func:`make_card`.
     """
-    if not name or set(name) - set("abcdefghijklmnopqrstuvwxyz0123456789-_."):
-        raise ValueError(f"a name in the zoo has small letters, digits, - _ and . alone, got {name!r}.")
-    card, place = make_card(run, evaluations), folder / name
-    place.mkdir(parents=True, exist_ok=True)
+    if not re.fullmatch("[a-z0-9][a-z0-9._-]*", name):
+        raise ValueError(f"a name in the zoo has small letters and digits, and - _ . after the first, got {name!r}.")
+    place = folder / name
+    if place.exists():
+        raise ValueError(f"the zoo has a policy {name!r} already; give another name, or remove {place} first.")
+    card = make_card(run, evaluations)
+    place.mkdir(parents=True)
     shutil.copyfile(run / zoo.POLICY, place / zoo.POLICY)
     write_json(place / zoo.CARD, card)
     return place
@@ -108,13 +118,18 @@ def listed() -> Table:
     kinds = list(dict.fromkeys(kind for card in cards.values() for kind in card["measures"]))
     table = Table("zoo:", "parameters", "hours", title="policies that come with the package")
     for kind in kinds:
+        table.add_column(f"{kind}\nscenes", justify="right")
         for measure in SHOWN:
             table.add_column(f"{kind}\n{measure.replace('_', ' ')}", justify="right")
     for name, card in cards.items():
-        means = [card["measures"].get(kind, {}).get("mean", {}) for kind in kinds]
-        cells = ["–" if mean.get(measure) is None else f"{mean[measure]:.3f}" for mean in means for measure in SHOWN]
+        measured = [card["measures"].get(kind, {"mean": {}, "scenes": "–"}) for kind in kinds]
+        cells = [cell for each in measured for cell in (str(each["scenes"]), *(_shown(each["mean"], m) for m in SHOWN))]
         table.add_row(name, f"{card['parameters']:,}", f"{card['hours']:.1f}", *cells)
     return table
+
+
+def _shown(mean: dict[str, float | None], measure: str) -> str:
+    return "–" if mean.get(measure) is None else f"{mean[measure]:.3f}"
 
 
 def _named(text: str) -> tuple[str, Path]:

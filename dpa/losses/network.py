@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModule, TensorDictParams
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
+from dpa.models.base import check_logits
 from dpa.models.distribution import TOKENS, Distribution
 from dpa.models.precision import Precision, check_precision, running_in
 from envs import keys
@@ -78,9 +79,15 @@ def network_input(context: TensorDictBase, tokens: Tensor, token_valid: Tensor) 
 
 
 def logits_under(parameters: TensorDictParams, network: TensorDictModule, batch: TensorDictBase) -> Tensor:
-    """Logits ``[S, M, A, T, P]`` of a network under some parameters of its kind; the batch stays as it is."""
+    """Logits ``[S, M, A, T, P]`` of a network under some parameters of its kind; the batch stays as it is.
+
+    Raises:
+        ContractError: logits of other agents or decisions than those of the tokens.
+    """
     with parameters.to_module(network):
-        return network(batch.copy())[LOGITS]
+        logits = network(batch.copy())[LOGITS]
+    check_logits(logits, batch[keys.TOKENS], f"{type(model_of(network)).__name__}.forward")
+    return logits
 
 
 def reference_logits(loss: LossModule, batch: TensorDictBase) -> Tensor:

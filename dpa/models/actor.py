@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from dpa.models.base import Decision, MotionModel, Observation, of_agents
+from dpa.models.base import ContractError, Decision, MotionModel, Observation, of_agents
 from dpa.models.context import Context, Contexts, collate_contexts, pad_context
 from dpa.models.distribution import Distribution
 from dpa.models.precision import Precision, check_precision, running_in
@@ -152,6 +152,7 @@ class MotionActor(TensorDictModuleBase):
         chooser = self.chooser(tensordict)
         with running_in(self.precision, seen.recent.device):
             decision = self._memory.step(seen, chooser)
+        self._check_decision(decision, seen)
         self._last = decision.token
         return decision, chooser
 
@@ -176,6 +177,17 @@ class MotionActor(TensorDictModuleBase):
         acted = self.model.tokenizer.of_numbers((step[:, None] > 0) & tensordict[keys.CONTROLLED])
         last = torch.where(acted, self._last, self.model.no_token)
         return Observation(tensordict[keys.RECENT], last, step, max(at), tensordict[keys.KIND], tensordict[keys.VALID])
+
+    def _check_decision(self, decision: object, seen: Observation) -> None:
+        """Refuse what a memory may not give: broadcast, it would pass for a decision of other agents."""
+        rows, what = seen.valid.shape, type(decision).__name__
+        wanted = f"a Decision of tokens {[*rows, *self.model.tokenizer.shape]} and logits {[*rows, 'P']}"
+        if isinstance(decision, Decision):
+            token, logits = (getattr(value, "shape", torch.Size()) for value in decision)
+            if token == (*rows, *self.model.tokenizer.shape) and logits[:-1] == rows:
+                return
+            what = f"tokens {list(token)} and logits {list(logits)}"
+        raise ContractError(f"the memory of {type(self.model).__name__} must give {wanted} at every step, got {what}.")
 
     # --- the start of episodes --------------------------------------------------------------------------------------
     def _start(self, tensordict: TensorDictBase, at: list[int]) -> None:

@@ -170,6 +170,35 @@ class MotionModel(nn.Module, ABC):
         """Memory of one agent of one rollout while it runs: what is kept of it, and what a decision computes."""
 
 
+class ContractError(ValueError):
+    """A policy gives something else than :class:`MotionModel` says; the message names the method."""
+
+
+def check_logits(logits: Any, tokens: Tensor, who: str, vocab_size: int | None = None) -> None:
+    """Refuse logits that are not of these tokens.
+
+    Args:
+        logits: what ``who`` gave.
+        tokens: ``[S, M, A, T, ...]``.
+        who: gives them, for the message.
+        vocab_size: V, where they are of a vocabulary that is known.
+
+    Raises:
+        ContractError: no tensor, or one of another shape than ``[S, M, A, T, P]``.
+
+    Examples:
+        >>> import torch
+        >>> check_logits(torch.zeros(1, 2, 5, 3, 9), torch.zeros(1, 2, 3, 5), "Own.forward")
+        Traceback (most recent call last):
+        ...
+        dpa.models.base.ContractError: Own.forward must give logits [1, 2, 3, 5, 'P'], got [1, 2, 5, 3, 9].
+    """
+    wanted = [*tokens.shape[:4], vocab_size or "P"]
+    got = list(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__
+    if not isinstance(logits, Tensor) or got[:4] != wanted[:4] or len(got) != 5 or vocab_size not in (None, got[4]):
+        raise ContractError(f"{who} must give logits {wanted}, got {got}.")
+
+
 def named_size(config: Any, sizes: Mapping[str, Any]) -> Any:
     """The configuration itself, or the one of its name.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields, is_dataclass
 from typing import Any, NamedTuple
 
 from dpa.models import behaviorgpt, motionlm, smart, trajeglish
@@ -36,6 +36,25 @@ FAMILIES: dict[str, Family] = {
 """Families that a YAML can name; add one of your own here (docs/how-to.md)."""
 
 
+def family_of(name: str) -> Family:
+    """The family of a name.
+
+    Raises:
+        ValueError: there is none, or its sizes are no configurations.
+    """
+    if name not in FAMILIES:
+        raise ValueError(
+            f"model.family must be one of {sorted(FAMILIES)}, got {name!r}; one of your own is a line in FAMILIES of "
+            f"{__name__}."
+        )
+    family = FAMILIES[name]
+    for size, config in family.sizes.items():
+        held = [field.name for field in fields(config)] if is_dataclass(config) else []
+        if missing := [field for field in ("horizon", "dropout") if field not in held]:
+            raise ValueError(f"size {size!r} of {name} must be a dataclass with horizon and dropout, lacks {missing}.")
+    return family
+
+
 def size_of(family: str, size: str) -> dict[str, Any]:
     """The configuration of a named size, as a checkpoint holds it.
 
@@ -46,9 +65,7 @@ def size_of(family: str, size: str) -> dict[str, Any]:
         >>> size_of("motionlm", "nano")["width"]
         48
     """
-    if family not in FAMILIES:
-        raise ValueError(f"model.family must be one of {sorted(FAMILIES)}, got {family!r}.")
-    sizes = FAMILIES[family].sizes
+    sizes = family_of(family).sizes
     if size not in sizes:
         raise ValueError(f"model.size must be one of {sorted(sizes)}, got {size!r}.")
     return asdict(sizes[size])
@@ -67,6 +84,6 @@ def build_model(config: Mapping[str, Any], tokenizer: MotionTokenizer) -> Motion
         >>> build_model(config, VerletTokenizer()).context.max_pieces
         256
     """
-    family = FAMILIES[config["family"]]
+    family = family_of(config["family"])
     size = type(next(iter(family.sizes.values())))(**config["model"])
     return family.model(size, tokenizer, family.context(**config["context"]))

@@ -21,8 +21,6 @@ PANEL = 2.55
 """Side of the picture of a rollout [inches]."""
 MARKS = {"collision": ("X", "#000000"), "off road": ("v", "#f0b400")}
 """Marker and colour; shape repeats what colour says."""
-LEGEND_ENTRY = 1.45
-"""Width of an entry of the legend [inches]."""
 LOG_PATH = {"color": LOG_COLOR, "lw": 0.8, "ls": (0, (2, 1.5))}
 
 
@@ -82,15 +80,13 @@ def draw_legend(figure: Figure, scenes: Sequence[Scene], found: Sequence[Sequenc
         if any(bool((first[place] >= 0).any()) for first in found)
     ]
     handles = [*agents.values(), Line2D([], [], **LOG_PATH, label="path in the log"), *marks]
-    rows = -(-len(handles) * LEGEND_ENTRY // figure.get_figwidth())
-    figure.legend(
-        handles=handles,
-        loc="outside lower center",
-        ncols=int(-(-len(handles) // rows)),
-        frameon=False,
-        fontsize=8.5,
-        labelcolor=INK,
-    )
+    style = {"loc": "outside lower center", "frameon": False, "fontsize": 8.5, "labelcolor": INK}
+    renderer = figure.canvas.get_renderer()
+    for columns in range(len(handles), 0, -1):  # as many as the figure is wide
+        legend = figure.legend(handles=handles, ncols=columns, **style)
+        if columns == 1 or legend.get_window_extent(renderer).width <= figure.bbox.width:
+            return
+        legend.remove()
 
 
 def first_new(happens: Tensor, logged: Tensor) -> Tensor:

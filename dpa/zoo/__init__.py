@@ -82,8 +82,8 @@ def _folder_of(name: str, folder: Path) -> Path:
     known = names(folder)
     if name not in known:
         near = difflib.get_close_matches(name, known, n=1)
-        hint = f"did you mean zoo:{near[0]}? " if near else ""
+        hint = f" Did you mean zoo:{near[0]}?" if near else ""
         raise ValueError(
-            f"the zoo has no policy {name!r}; {hint}It has {', '.join(known) or 'none'} (python -m recipes.zoo)."
+            f"the zoo has no policy {name!r}; it has {', '.join(known) or 'none'} (python -m recipes.zoo).{hint}"
         )
     return folder / name

@@ -59,7 +59,7 @@ def add_options(part: argparse.ArgumentParser) -> None:
     )
     part.add_argument("--against", metavar="DIR", help="another checkout of the project, measured in turn")
     part.add_argument("--agents", type=int, default=24, help="of a scene at most (default: %(default)s)")
-    part.add_argument("--pieces", type=int, default=256, help="of the map (default: %(default)s)")
+    part.add_argument("--pieces", type=int, help="of the map (default: those of the policy's YAML)")
     part.add_argument(
         "--cores", type=int, default=2, help="threads of one process, or processes (default: %(default)s)"
     )
@@ -78,7 +78,7 @@ def measure(options: dict[str, Any]) -> list[dict[str, Any]]:
         ValueError: a number that cannot be, or a checkout without the recipe.
         OSError: a training ended with an error.
     """
-    for name, least in (("agents", 1), ("pieces", 1), ("cores", 1), ("scenes", BATCH), ("epochs", 2), ("repeats", 1)):
+    for name, least in (("agents", 1), ("cores", 1), ("scenes", BATCH), ("epochs", 2), ("repeats", 1)):
         if options[name] < least:
             raise ValueError(f"--{name} must be {least} or more, got {options[name]}.")
     here = [(HERE, precision) for precision in options["precision"] or [None]]
@@ -108,7 +108,6 @@ def run(case: Case, options: dict[str, Any], scenes: Path, output: Path) -> dict
     made = f"max_agents={options['agents']},windows=1,scenes_per_unit=1"
     arguments = [
         f"model={case.model}",
-        f"model.context.max_pieces={options['pieces']}",
         f"pretraining.max_agents={options['agents']}",
         f"pretraining.batch_size={BATCH}",
         f"pretraining.steps={epoch * options['epochs']}",
@@ -121,6 +120,7 @@ def run(case: Case, options: dict[str, Any], scenes: Path, output: Path) -> dict
         f"scenes.cache={scenes}",
         f"threads={case.threads}",
         f"output={output}",
+        *([] if options["pieces"] is None else [f"model.context.max_pieces={options['pieces']}"]),
         *([] if case.precision is None else [f"pretraining.precision={case.precision}"]),
     ]
     several = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={case.processes}"]

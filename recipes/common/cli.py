@@ -25,6 +25,7 @@ from dpa.training.distributed import started_ranks
 from dpa.training.loggers import check_backend
 from envs.allocator import keep_freed_memory
 from envs.options import differences
+from recipes.common.kinds import check_kinds
 from recipes.common.limits import check_added, check_limits
 
 CONFIG = {"version_base": "1.3", "config_path": str(Path(__file__).parents[1] / "config")}
@@ -159,7 +160,8 @@ def build(target: Callable[..., Any], section: DictConfig, name: str, *args: Any
     """Call ``target`` with a section of the configuration as keyword arguments.
 
     Raises:
-        ValueError: a key that the target does not take, or one that it lacks; the message names both.
+        ValueError: a key that the target does not take, one that it lacks, or a value of another kind than it says; the
+            message names both.
     """
     options = plain(section)
     parameters = signature(target).parameters.values()
@@ -171,7 +173,9 @@ def build(target: Callable[..., Any], section: DictConfig, name: str, *args: Any
         signature(target).bind(*args, **options, **fixed)
     except TypeError as error:
         raise ValueError(f"{name} {error}.") from None
-    return target(*args, **options, **fixed)
+    check_kinds(target, options, name.partition(" (")[0])
+    with told_of(name):
+        return target(*args, **options, **fixed)
 
 
 def finite(value: float) -> float | None:

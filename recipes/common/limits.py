@@ -42,10 +42,9 @@ COUNTS = (
     *("threads", "count", "parts", "shard_size", "chunk_scenes", "num_rollouts", "drift_rollouts", "kept", "each"),
     *("steps", "batch_size", "batch_scenes", "scenes_per_step", "pairs_per_scene", "max_rows", "stride", "width"),
     *("checkpoint_interval", "tune_interval", "watch_interval", "look_interval", "watch_scenes", "watch_pairs"),
-    *("max_controlled", "max_pieces", "patience", "pretraining.max_agents", "window"),
+    *("max_controlled", "patience", "pretraining.max_agents", "window"),
     *("passes",),
 )
-BINS = ("bins.vehicle", "bins.pedestrian", "bins.cyclist")
 LIMITS: dict[str, Limit] = {
     **dict.fromkeys(COUNTS, COUNT),
     **dict.fromkeys(("workers", "warmup", "staleness", "part", "top_k", "min_agents", "pictures.scenes"), NUMBER),
@@ -54,7 +53,7 @@ LIMITS: dict[str, Limit] = {
         COUNT._replace(empty=True),
     ),
     **dict.fromkeys(("seed", "split_seed"), Limit(int)),
-    **dict.fromkeys(("memory", "max_norm", "lr", "rms", "length", "piece_length", "temperature", "top_p"), POSITIVE),
+    **dict.fromkeys(("memory", "max_norm", "lr", "rms", "length", "temperature", "top_p"), POSITIVE),
     **dict.fromkeys(("noise", "dropout", "mirror", "label_smoothing"), SHARE),
     "pretraining.recovery": SHARE._replace(above=True),
     **dict.fromkeys(("weight_decay", "keep_gib"), Limit(float, least=0)),
@@ -65,8 +64,7 @@ LIMITS: dict[str, Limit] = {
     **dict.fromkeys(("compile", "arrivals", "tokenized", "loss.reference"), FLAG),
     **dict.fromkeys(("output", "policy", "preferences"), Limit(str)),
     **dict.fromkeys(("show", "years"), Limit(list)),
-    **dict.fromkeys(("rankings", "rewards", "bins", "tokenizer", "setup", "labels", "published"), Limit(dict)),
-    **dict.fromkeys(BINS, POSITIVE._replace(many=True)),
+    **dict.fromkeys(("rankings", "rewards", "context", "tokenizer", "setup", "labels", "published"), Limit(dict)),
     "grid": Limit(float, many=True),
     **dict.fromkeys(("start", "trained"), Limit(str, empty=True)),
     "optimizer": Limit(str, among=OPTIMIZERS),
@@ -79,6 +77,8 @@ LIMITS: dict[str, Limit] = {
     "snapshots": COUNT._replace(many=True),
 }
 """Limit of an option by its last name, or by its last two where one name has several meanings."""
+OWN = ("model.context", "model.tokenizer")
+"""Sections whose options are those of a class, of the user's own perhaps: :mod:`recipes.common.kinds` judges them."""
 CLOSED = (
     *("", "pretraining", "collection", "alignment", "evaluation", "decoding", "pictures", "experiment", "logger"),
     *("training", "method", "model", "scenes"),
@@ -165,7 +165,8 @@ def _leaves(section: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
     for key, value in section.items():
         if not isinstance(value, dict):
             yield f"{prefix}{key}", value
-        elif key not in ("labels", "values"):  # their entries are named after methods, not options
+        # Entries of labels and values are named after methods, not options.
+        elif key not in ("labels", "values") and f"{prefix}{key}" not in OWN:
             yield from _leaves(value, f"{prefix}{key}.")
 
 

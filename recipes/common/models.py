@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from dpa import zoo
 from dpa.models import MotionModel
-from dpa.models.registry import FAMILIES, build_model, size_of
+from dpa.models.registry import build_model, family_of, size_of
 from dpa.tokens import KDisksTokenizer, MotionTokenizer, PatchTokenizer, VerletTokenizer
 from dpa.training.checkpoint import CheckpointError, load_policy, load_weights, save_policy
 from envs.episode import EPISODE_STEPS, EpisodeOptions
@@ -29,6 +29,20 @@ TOKENIZERS: dict[str, type[MotionTokenizer]] = {
 """Tokenizers that a YAML can name; add a class of your own here (docs/how-to.md)."""
 
 
+def tokenizer_class(name: str) -> type[MotionTokenizer]:
+    """The tokenizer of a name.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if name not in TOKENIZERS:
+        raise ValueError(
+            f"model.tokenizer.name must be one of {sorted(TOKENIZERS)}, got {name!r}; one of your own is a line in "
+            f"TOKENIZERS of {__name__}."
+        )
+    return TOKENIZERS[name]
+
+
 def tokenizer_config(cfg: DictConfig) -> dict[str, Any]:
     """What decides a tokenizer, from ``cfg.model.tokenizer``, as a checkpoint holds it.
 
@@ -36,9 +50,7 @@ def tokenizer_config(cfg: DictConfig) -> dict[str, Any]:
         ValueError: there is no such tokenizer, or its file is none.
     """
     options = plain(cfg.tokenizer)
-    if options["name"] not in TOKENIZERS:
-        raise ValueError(f"model.tokenizer.name must be one of {sorted(TOKENIZERS)}, got {options['name']!r}.")
-    return {"name": options["name"], **TOKENIZERS[options["name"]].settled(**without_name(options))}
+    return {"name": options["name"], **tokenizer_class(options["name"]).settled(**without_name(options))}
 
 
 def episode_options(cfg: DictConfig) -> EpisodeOptions:
@@ -57,7 +69,7 @@ def policy_config(cfg: DictConfig) -> dict[str, Any]:
     return {
         "family": cfg.family,
         "model": size | {"horizon": episode.horizon, "dropout": cfg.dropout},
-        "context": asdict(build(FAMILIES[cfg.family].context, cfg.context, "model.context")),
+        "context": asdict(build(family_of(cfg.family).context, cfg.context, "model.context")),
         "tokenizer": tokenizer_config(cfg),
         "episode": asdict(episode),
     }
@@ -103,8 +115,13 @@ def named_model(name: str) -> MotionModel:
 
 
 def build_tokenizer(section: Mapping[str, Any]) -> MotionTokenizer:
-    """The tokenizer that ``name`` of a section names, with the section's other options."""
-    return build(TOKENIZERS[section["name"]], DictConfig(without_name(section)), f"model.tokenizer ({section['name']})")
+    """The tokenizer that ``name`` of a section names, with the section's other options.
+
+    Raises:
+        ValueError: there is none of this name, or it does not take these options.
+    """
+    name = section["name"]
+    return build(tokenizer_class(name), DictConfig(without_name(section)), f"model.tokenizer ({name})")
 
 
 def write_policy(path: Path, model: MotionModel, config: dict[str, Any], metadata: dict[str, Any]) -> None:
@@ -159,7 +176,8 @@ def open_policy(path: str | Path, device: str = "cpu") -> tuple[MotionModel, Epi
     try:
         model, episode = build_policy(config), EpisodeOptions(**config["episode"])
     except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise CheckpointError(f"{path} has a configuration that makes no policy ({error!r}).") from None
+        told = error if isinstance(error, ValueError) else repr(error)
+        raise CheckpointError(f"{path} has a configuration that makes no policy: {told}") from None
     load_weights(model, weights, config, config, where=str(path))
     return model.to(device).eval(), episode, config
 

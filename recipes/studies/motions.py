@@ -48,7 +48,7 @@ class Sight:
             log away.
 
     Raises:
-        ValueError: ``tokenized`` is neither true nor false, no such stride, or an unknown feature.
+        ValueError: no such stride, or an unknown feature.
 
     Examples:
         >>> Sight().width
@@ -60,10 +60,8 @@ class Sight:
     tokenized: bool = True
 
     def __post_init__(self) -> None:
-        if not isinstance(self.tokenized, bool):
-            raise ValueError(f"sight.tokenized must be true or false, got {self.tokenized!r}.")
-        if not isinstance(self.stride, int) or not 1 <= self.stride <= CURRENT_STEP:
-            raise ValueError(f"sight.stride must be 1 to {CURRENT_STEP}, the history of a scene, got {self.stride!r}.")
+        if not 1 <= self.stride <= CURRENT_STEP:
+            raise ValueError(f"stride must be 1 to {CURRENT_STEP}, the history of a scene, got {self.stride!r}.")
         feature_names(self.road)
 
     @property

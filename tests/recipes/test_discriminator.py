@@ -311,7 +311,7 @@ def test_what_lies_behind_a_hole_of_the_log_has_no_jerk() -> None:
         (["training.steps=0"], "training.steps must be 1 or more, got 0"),
         (["policies=[]"], "policies=.. names no policy"),
         (["sight.road=[sky]"], "unknown features .'sky'."),
-        (["sight.stride=20"], "sight.stride must be 1 to 10"),
+        (["sight.stride=20"], "sight: stride must be 1 to 10"),
         (["sight.tokenized=perhaps"], "tokenized must be true or false, got 'perhaps'"),
         (["+sight.colour=red"], "sight has no option 'colour'"),
         (["ranking.kind=astrology"], "ranking.kind must be one of"),

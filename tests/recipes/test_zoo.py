@@ -49,9 +49,9 @@ def test_a_name_opens_the_file_and_a_path_stays_a_path() -> None:
 
 
 def test_a_wrong_name_is_refused_with_the_nearest_one() -> None:
-    with pytest.raises(ValueError, match="no policy 'motionlm-nan-sumo'; did you mean zoo:motionlm-nano-sumo"):
+    with pytest.raises(ValueError, match="policy 'motionlm-nan-sumo'; it has .* Did you mean zoo:motionlm-nano-sumo"):
         policy_file("zoo:motionlm-nan-sumo")
-    with pytest.raises(ValueError, match="no policy '../secret'; It has behaviorgpt-nano-sumo, motionlm"):
+    with pytest.raises(ValueError, match="no policy '../secret'; it has behaviorgpt-nano-sumo, motionlm"):
         policy_file("zoo:../secret")
 
 
@@ -139,10 +139,23 @@ def test_what_has_seen_scenes_with_a_licence_is_not_given_away(
         command.add("new", trained, {}, tmp_path / "zoo")
 
 
-@pytest.mark.parametrize("name", ["", "../up", "A", "a b"])
-def test_a_name_that_is_no_folder_is_refused(name: str, trained: Path, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="small letters, digits"):
-        command.add(name, trained, {}, tmp_path / "zoo")
+@pytest.mark.parametrize("name", ["", "..", ".", "../up", ".hidden", "A", "a b"])
+def test_a_name_that_is_no_folder_is_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="small letters and digits"):
+        command.add(name, tmp_path, {}, tmp_path / "zoo")
+
+
+def test_a_policy_that_is_there_is_not_replaced(trained: Path, shelf: Path) -> None:
+    before = zoo.card("mine", shelf)
+    with pytest.raises(ValueError, match="has a policy 'mine' already; give another name, or remove .*mine first"):
+        command.add("mine", trained, {}, shelf)
+    assert zoo.card("mine", shelf) == before
+
+
+def test_an_aligned_policy_is_refused_for_what_it_is(trained: Path, tmp_path: Path) -> None:
+    marked(trained, method="dpa_omf")
+    with pytest.raises(ValueError, match="was aligned by dpa_omf; the zoo takes policies of recipes.pretrain alone"):
+        command.add("new", trained, {}, tmp_path / "zoo")
 
 
 def test_a_training_without_a_policy_is_refused(tmp_path: Path) -> None:

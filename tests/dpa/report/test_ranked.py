@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 
 from dpa.ranking import log_trajectory
+from dpa.report.canvas import blank_figure
+from dpa.report.panels import draw_legend
 from dpa.report.ranked import incidents, plot_ranked
 from envs.scene import Scene
 from envs.sources.synthetic import straight_road, two_cars_head_on
@@ -86,6 +88,20 @@ def test_a_mark_that_is_not_used_is_not_explained(
 ) -> None:
     plot_ranked(scene, rollouts[[0, 3]], torch.tensor([0.0, 1.0]), EVERYBODY, tmp_path / "r.png", each=1)
     assert not [text for text in drawn[0].legends[0].get_texts() if "not in the log" in text.get_text()]
+
+
+@pytest.mark.parametrize(("width", "one_row"), [(2.55, False), (4.0, False), (5.1, False), (20.0, True)])
+def test_the_legend_is_as_wide_as_the_figure_allows(
+    scene: Scene, rollouts: Tensor, width: float, one_row: bool
+) -> None:
+    figure = blank_figure(width, 4.0)
+    figure.subplots()
+    draw_legend(figure, [scene], [incidents(scene, rollouts, EVERYBODY)])
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    box = legend.get_window_extent()
+    assert box.x0 >= 0 and box.x1 <= figure.bbox.width, "nothing is cut off"
+    assert (legend._ncols == len(legend.get_texts())) == one_row
 
 
 @pytest.mark.parametrize("each", [0, 3])
