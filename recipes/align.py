@@ -36,7 +36,7 @@ from recipes.alignment.snapshots import Snapshots
 from recipes.alignment.step import AlignmentStep
 from recipes.alignment.watch import Watch
 from recipes.common.cli import CONFIG, check_steps, finished, finite, ranked_recipe
-from recipes.common.models import check_written, policy_file, write_policy
+from recipes.common.models import check_written, given_policy, write_policy
 from recipes.common.scenes import open_splits
 
 SATURATED = "saturated"
@@ -190,9 +190,10 @@ def tell(method: DictConfig, warning: str | None, ranks: Ranks) -> None:
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.align``."""
     check_steps(cfg.alignment, "alignment")
+    policy = given_policy(cfg.policy)
     splits = open_splits(cfg.scenes)
     on_policy = cfg.method.data.kind in ON_POLICY and OmegaConf.is_missing(cfg, "preferences")
-    policy, preferences = policy_file(cfg.policy), None if on_policy else Path(cfg.preferences)
+    preferences = None if on_policy else Path(cfg.preferences)
     expert = None if cfg.expert is None else Path(cfg.expert)
     watch = None if cfg.watch is None else Watch(splits.tune, Path(cfg.watch), policy)
     with join_ranks(cfg.device) as ranks:

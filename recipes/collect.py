@@ -26,7 +26,7 @@ from envs.files import write_json
 from envs.progress import progress
 from envs.store import SceneStore
 from recipes.common.cli import CONFIG, build, plain, recipe
-from recipes.common.models import open_policy, policy_file, weights_digest
+from recipes.common.models import given_policy, open_policy, weights_digest
 from recipes.common.rankings import build_distance
 from recipes.common.scenes import fingerprint, open_splits
 
@@ -114,11 +114,12 @@ def check_collection(options: DictConfig) -> tuple[Decoding, Workers]:
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.collect``."""
+    policy = given_policy(cfg.policy)
     scenes = open_splits(cfg.scenes)[cfg.split]
     if not 0 <= cfg.part < cfg.parts:
         raise ValueError(f"part must be from 0 to parts - 1, got part={cfg.part} of parts={cfg.parts}.")
     indices = range(cfg.part, len(scenes), cfg.parts)
-    store = collect(cfg, scenes, policy_file(cfg.policy), cfg.seed, Path(cfg.output), indices)
+    store = collect(cfg, scenes, policy, cfg.seed, Path(cfg.output), indices)
     if cfg.json is not None:
         write_json(cfg.json, data_card(store).to_json())
     print(f"preferences of {len(store)} scenes: {cfg.output}")

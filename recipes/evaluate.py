@@ -26,7 +26,7 @@ from envs.progress import progress
 from envs.scene import CURRENT_STEP
 from envs.store import SceneStore
 from recipes.common.cli import CONFIG, build, deciding, finished, finite, mean_known, recipe
-from recipes.common.models import open_policy, policy_file, weights_digest
+from recipes.common.models import given_policy, open_policy, weights_digest
 from recipes.common.partial import PartialResult
 from recipes.common.rankings import build_distance
 from recipes.common.rolled import Rolled, rolled
@@ -198,9 +198,9 @@ def main(cfg: DictConfig) -> None:
     if cfg.submission is not None:
         rollouts = cfg.evaluation.num_rollouts
         plan = plan_submission(cfg.submission, cfg.submission_metadata, rollouts, cfg.submission_shards)
+    policy, decoding = given_policy(cfg.policy), build(Decoding, cfg.decoding, "decoding")
     scenes = open_splits(cfg.scenes)[cfg.split]
-    decoding = build(Decoding, cfg.decoding, "decoding")
-    result = evaluate(cfg, scenes, policy_file(cfg.policy), decoding, cfg.seed, Path(cfg.json), plan)
+    result = evaluate(cfg, scenes, policy, decoding, cfg.seed, Path(cfg.json), plan)
     width = max(map(len, FIGURES))
     for name, value in result["mean"].items():
         print(f"{name:{width}}  {'–' if value is None else format(value, '.4f')}")

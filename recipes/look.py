@@ -24,7 +24,7 @@ from envs import keys
 from envs.scene import Scene
 from envs.store import SceneStore
 from recipes.common.cli import CONFIG, build, recipe
-from recipes.common.models import open_policy, policy_file
+from recipes.common.models import given_policy, open_policy
 from recipes.common.rankings import open_preferences
 from recipes.common.rolled import stored
 from recipes.common.scenes import open_splits
@@ -176,8 +176,9 @@ def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.look``."""
     if cfg.figure not in FIGURES:
         raise ValueError(f"figure must be one of {', '.join(FIGURES)}, got {cfg.figure!r}.")
+    policy = given_policy(cfg.policy)
     scenes = open_splits(cfg.scenes)[cfg.split]
-    group = open_ranked(policy_file(cfg.policy), Path(cfg.preferences), scenes, str(cfg.scene))
+    group = open_ranked(policy, Path(cfg.preferences), scenes, str(cfg.scene))
     output = Path(cfg.output)
     output.parent.mkdir(parents=True, exist_ok=True)
     if cfg.figure == "coupling":

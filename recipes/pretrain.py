@@ -348,6 +348,8 @@ def negative_log_likelihood(
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.pretrain``."""
     check_steps(cfg.pretraining, "pretraining")
+    start = cfg.pretraining.start
+    config_to_train(cfg, None if start is None else Origin.open(start))  # refused before scenes are converted
     splits = open_splits(cfg.scenes)
     with join_ranks(cfg.device) as ranks:
         made_by = provenance("pretrain", cfg.device)

@@ -19,7 +19,7 @@ from envs import keys
 from envs.progress import progress
 from envs.store import SceneStore
 from recipes.common.cli import CONFIG, recipe
-from recipes.common.models import open_policy, policy_file
+from recipes.common.models import given_policy, open_policy
 from recipes.common.rankings import build_distance, open_preferences
 from recipes.common.rolled import stored
 from recipes.common.scenes import open_splits
@@ -67,8 +67,9 @@ def _fields(ranked: Ranking) -> dict[str, Tensor]:
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.rerank``."""
+    policy = given_policy(cfg.policy)
     scenes = open_splits(cfg.scenes)[cfg.split]
-    store = rerank(cfg.ranking, scenes, policy_file(cfg.policy), Path(cfg.preferences), Path(cfg.output))
+    store = rerank(cfg.ranking, scenes, policy, Path(cfg.preferences), Path(cfg.output))
     print(f"preferences of {len(store)} scenes: {cfg.output}")
 
 

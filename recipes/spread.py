@@ -86,8 +86,8 @@ def main(cfg: DictConfig) -> None:
     names = feature_names(cfg.features if isinstance(cfg.features, str) else list(cfg.features))
     if cfg.split == "eval":
         raise ValueError("split=eval: spreads become part of a distance, which is not fitted on evaluation scenes.")
-    scenes = open_splits(cfg.scenes)[cfg.split]
     model, options, _ = open_policy(cfg.policy)
+    scenes = open_splits(cfg.scenes)[cfg.split]
     store = open_preferences(cfg.preferences, scenes, model, cfg.policy)
     every = progress(range(len(store)), "spread", unit="scene")
     rows = spreads(stored(store, every, scenes, model, options), names)

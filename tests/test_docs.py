@@ -16,6 +16,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from dpa.models.registry import FAMILIES
 from dpa.ranking import AGGREGATES, FEATURES, SOLVERS
 from dpa.report.likelihoods import who_learns
 from dpa.report.statistics import paired_bootstrap
@@ -51,7 +52,7 @@ PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *sorted((REPO
 COMMANDED = [*PAGES, *sorted(CONFIG.rglob("*.yaml")), *sorted((REPOSITORY / "recipes").glob("*.py"))]
 """Files that tell users what to run."""
 NOT_RUN = "<!-- not run by tests/test_docs.py"
-REGISTRIES = (AGGREGATES, FEATURES, LOSSES, SOLVERS, SOURCES, TOKENIZERS)
+REGISTRIES = (AGGREGATES, FAMILIES, FEATURES, LOSSES, SOLVERS, SOURCES, TOKENIZERS)
 """What examples add to."""
 
 

@@ -165,6 +165,8 @@ def read_vocabulary(path: Path) -> Vocabulary:
         FileNotFoundError: no such file.
         ValueError: the file is damaged, or is no vocabulary.
     """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist; make a vocabulary with python -m recipes.vocabulary.")
     try:
         with np.load(path, allow_pickle=False) as held:
             motions, card = torch.from_numpy(held["motions"]), json.loads(held["card"].tobytes())

@@ -337,6 +337,9 @@ def _write(path: Path, payload: dict[str, Any]) -> None:
 
 
 def _read(path: Path, kind: str) -> dict[str, Any]:
+    if path.is_dir():
+        held = f" ({path / 'policy.pt'}?)" if (path / "policy.pt").is_file() else ""
+        raise FileNotFoundError(f"{path} is a folder; give the file of a saved {kind}{held}.")
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist; give the path of a saved {kind}.")
     try:

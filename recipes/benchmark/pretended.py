@@ -86,7 +86,7 @@ class Pretended(DeviceCount):
         super().__init__(DEVICE)
 
     def run(self, func: Callable, args: tuple, kwargs: dict[str, Any]) -> Any:
-        """Refuse what does not meet on a device; compute on the CPU."""
+        """Refuse what does not meet on a device, and what the CPU lacks; compute on the CPU."""
         given = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
         place = kwargs.get("device")
         there = any(isinstance(value, There) for value in given)
@@ -99,7 +99,10 @@ class Pretended(DeviceCount):
         if place is not None and torch.device(place).type == DEVICE:
             kwargs = kwargs | {"device": torch.device("cpu")}
         wrapped = {id(value.held): value for value in given if isinstance(value, There)}
-        out = func(*tree_map_only(There, _held, args), **tree_map_only(There, _held, kwargs))
+        try:
+            out = func(*tree_map_only(There, _held, args), **tree_map_only(There, _held, kwargs))
+        except NotImplementedError:
+            raise RuntimeError(f"{func} is of GPUs alone, and nobody here knows its values.") from None
         if not there:
             return out
         return tree_map_only(Tensor, lambda value: wrapped[id(value)] if id(value) in wrapped else There(value), out)

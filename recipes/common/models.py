@@ -160,6 +160,26 @@ def policy_file(name: str | Path) -> Path:
     return zoo.find(text.removeprefix(zoo.PREFIX)) if text.startswith(zoo.PREFIX) else Path(name)
 
 
+def given_policy(name: str) -> Path:
+    """The file of the policy that a recipe is given, which is whole: asked before scenes are converted for it.
+
+    Args:
+        name: file, or ``zoo:NAME``.
+
+    Raises:
+        FileNotFoundError: no such file.
+        CheckpointError: the file is damaged or no policy.
+        ValueError: the zoo has no such policy.
+
+    Examples:
+        >>> given_policy("zoo:motionlm-nano-sumo").name
+        'policy.pt'
+    """
+    file = policy_file(name)
+    load_policy(file)
+    return file
+
+
 def open_policy(path: str | Path, device: str = "cpu") -> tuple[MotionModel, EpisodeOptions, dict[str, Any]]:
     """A saved policy, the options of its episodes and its configuration.
 

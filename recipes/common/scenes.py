@@ -13,6 +13,7 @@ from omegaconf import DictConfig, ListConfig
 from envs.convert import convert
 from envs.seeding import make_generator
 from envs.shards import FORMAT_VERSION
+from envs.sources import SOURCES
 from envs.store import SceneStore
 from recipes.common.cli import build
 
@@ -48,10 +49,14 @@ def open_splits(cfg: DictConfig) -> Splits:
     source ``store``. So may be ``tune``; as a number it is so many of the training scenes, drawn with ``split_seed``.
 
     Raises:
-        ValueError: fewer training scenes than ``tune`` asks for, or scenes that are in two splits.
+        ValueError: nothing where a split should be, fewer training scenes than ``tune`` asks for, or scenes that are in
+            two splits.
     """
+    drawn = isinstance(cfg.tune, int)
+    for split in ("train", "eval") if drawn else ("train", "tune", "eval"):
+        _find(cfg, split)  # all that is named is there before any of it is converted, which can take hours
     train, held_out = (_chosen(_open(cfg, split), cfg.select, split) for split in ("train", "eval"))
-    if isinstance(cfg.tune, int):
+    if drawn:
         train, tune = _drawn(train, cfg.tune, cfg.split_seed)
     else:
         tune = _chosen(_open(cfg, "tune"), cfg.select, "tune")
@@ -89,12 +94,20 @@ def _chosen(scenes: SceneStore, select: DictConfig, split: str) -> SceneStore:
     return chosen
 
 
-def _open(cfg: DictConfig, split: str) -> SceneStore:
+def _find(cfg: DictConfig, split: str) -> list[str]:
+    """What the user named, which is there."""
     paths = cfg[split]
     if not isinstance(paths, str | ListConfig):
         number = "a number of training scenes, " if split == "tune" else ""
         raise ValueError(f"scenes.{split} must be {number}a path or a list of paths, got {paths!r}.")
     inputs = [paths] if isinstance(paths, str) else list(paths)
+    if cfg.source in SOURCES:
+        SOURCES[cfg.source].find(inputs)
+    return inputs
+
+
+def _open(cfg: DictConfig, split: str) -> SceneStore:
+    inputs = _find(cfg, split)
     if cfg.source == "store":
         return SceneStore(*inputs)
     name = hashlib.sha256("\n".join([f"{cfg.source} {FORMAT_VERSION}", *inputs]).encode()).hexdigest()[:12]

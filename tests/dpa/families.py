@@ -36,7 +36,7 @@ def tokens_of(family: str, steps: int = 5) -> MotionTokenizer:
 
 
 def smallest(family: str, tokenizer: MotionTokenizer | None = None, horizon: int = 16) -> MotionModel:
-    """A fresh policy, the same each time."""
+    """A fresh policy of a family's first size, the same each time."""
     torch.manual_seed(0)
-    size = size_of(family, "nano") | {"horizon": horizon}
+    size = size_of(family, next(iter(FAMILIES[family].sizes))) | {"horizon": horizon}
     return build_model({"family": family, "model": size, "context": {}}, tokenizer or tokens_of(family))

@@ -34,7 +34,9 @@ def habit(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     folder = tmp_path_factory.mktemp("config")
     (folder / "model").mkdir()
     (folder / "model/habit.yaml").write_text(block("yaml", "# recipes/config/model/habit.yaml"))
-    exec(compile(block("python", "# dpa/models/habit/__init__.py"), "how-to", "exec", dont_inherit=True), {})
+    namespace: dict = {}
+    for first in ("# dpa/models/habit/__init__.py", "from dpa.models.contract import check_contract"):
+        exec(compile(block("python", first), "how-to", "exec", dont_inherit=True), namespace)
     yield f"hydra.searchpath=[file://{folder}]"
     del FAMILIES["habit"]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,12 +15,21 @@ from omegaconf import DictConfig, OmegaConf
 
 from dpa.ranking import PreferenceDistance
 from dpa.tokens import VerletTokenizer
+from dpa.training.checkpoint import CheckpointError, load_policy, save_policy
 from envs.files import write_json
 from envs.sources.synthetic import straight_road
 from envs.store import SceneStore
 from recipes.common.cli import CONFIG, build, finished, recipe
 from recipes.common.limits import LIMITS, check_limits
-from recipes.common.models import TOKENIZERS, build_policy, policy_config
+from recipes.common.models import (
+    TOKENIZERS,
+    build_policy,
+    build_tokenizer,
+    given_policy,
+    open_policy,
+    policy_config,
+    policy_file,
+)
 from recipes.common.partial import PartialResult
 from recipes.common.scenes import fingerprint, open_splits
 from recipes.studies.motions import MotionShelf
@@ -28,6 +38,7 @@ RECIPES = (
     "pretrain", "collect", "align", "evaluate", "play", "ladder", "gap", "encounters", "references", "tokens",
     "compare", "validity", "sensitivity",
 )  # fmt: skip
+NANO = "zoo:motionlm-nano-sumo"
 WITHOUT_POLICY = tuple(recipe for recipe in RECIPES if recipe not in ("collect", "align", "evaluate"))
 pytestmark = pytest.mark.usefixtures("stores")
 
@@ -94,8 +105,8 @@ def test_an_option_that_is_missing_is_told_by_name(run: Callable, options: Calla
 def test_scenes_that_do_not_exist_are_told_by_path(
     run: Callable, options: Callable, recipe: str, tmp_path: Path
 ) -> None:
-    more = [] if recipe in WITHOUT_POLICY else ["policy=none.pt"]
-    more += {"play": ["policies=none.pt"], "compare": ["alignment.snapshots=[2]"]}.get(recipe, [])
+    more = [] if recipe in WITHOUT_POLICY else [f"policy={NANO}"]
+    more += {"play": [f"policies={NANO}"], "compare": ["alignment.snapshots=[2]"]}.get(recipe, [])
     name = "out.html" if recipe == "play" else "out"
     command = options(recipe, *more, "scenes.train=nowhere", f"{output_of(recipe)}={tmp_path / name}")
     assert_refused(run(recipe, *command), "nowhere")
@@ -389,6 +400,71 @@ def test_a_tokenizer_of_ones_own_has_the_options_of_its_class(monkeypatch: pytes
     cfg["tokenizer"]["table"] = "four"
     config = policy_config(OmegaConf.create(cfg))
     assert (config["episode"]["decision_steps"], config["model"]["horizon"]) == (4, 20), "8 s of decisions"
+
+
+def test_options_of_ones_own_classes_are_judged_by_their_annotations_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``bins``, ``noise`` and ``horizon`` are options elsewhere, with limits of their own."""
+
+    class Coarse(VerletTokenizer):
+        def __init__(self, bins: int = 15, noise: float = 2.0, horizon: tuple[int, ...] = ()) -> None:
+            super().__init__()
+
+    monkeypatch.setitem(TOKENIZERS, "coarse", Coarse)
+    with initialize_config_dir(CONFIG["config_path"], version_base="1.3"):
+        cfg = OmegaConf.to_container(compose("pretrain", ["model=nano"]))
+    cfg["model"]["tokenizer"] = {"name": "coarse", "bins": 21, "noise": 3.5, "horizon": [1, 2]}
+    check_limits(OmegaConf.create(cfg))
+    assert policy_config(OmegaConf.create(cfg).model)["tokenizer"]["bins"] == 21
+    wrong = {"bins": (1.5, "a whole number"), "noise": ("loud", "a number"), "horizon": ([1, 2.5], "a list of whole")}
+    for option, (value, words) in wrong.items():
+        section = {"name": "coarse", option: value}
+        with pytest.raises(
+            ValueError, match=rf"model\.tokenizer\.{option} must be {words}.*, got {re.escape(repr(value))}"
+        ):
+            build_tokenizer(section)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "option", "told"),
+    [
+        ("pretrain", "scenes.eval=num_scene=3", "num_scene"),
+        ("pretrain", "model.size=huge", "model.size must be one of"),
+        ("pretrain", "pretraining.start=none.pt", "none.pt does not exist"),
+        ("evaluate", "policy=none.pt", "none.pt does not exist"),
+        ("collect", "policy=none.pt", "none.pt does not exist"),
+        ("align", "policy=none.pt", "none.pt does not exist"),
+        ("rerank", "policy=none.pt", "none.pt does not exist"),
+    ],
+)
+def test_what_is_not_there_is_told_before_any_scene_is_converted(
+    run: Callable, options: Callable, tmp_path: Path, recipe: str, option: str, told: str
+) -> None:
+    made = "num_scenes=1,max_agents=4"
+    scenes = [
+        "scenes=sumo",
+        f'scenes.train="{made}"',
+        f'scenes.eval="{made},split=test"',
+        f"scenes.cache={tmp_path / 'c'}",
+    ]
+    more = [f"{output_of(recipe)}={tmp_path / 'out'}", *(["preferences=none"] if recipe in ("align", "rerank") else [])]
+    given = [each for each in options(recipe) if not each.startswith("scenes.")]
+    assert_refused(run(recipe, *given, *scenes, *more, option.replace("=num_scene=3", '="num_scene=3"')), told)
+    assert not (tmp_path / "c").exists()
+
+
+def test_a_folder_is_no_policy_and_the_file_in_it_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"is a folder; give the file of a saved policy\.$"):
+        given_policy(tmp_path)
+    (tmp_path / "policy.pt").touch()
+    with pytest.raises(FileNotFoundError, match=r"is a folder; give .* policy \(.*policy\.pt\?\)"):
+        given_policy(tmp_path)
+
+
+def test_a_policy_of_a_family_that_is_not_here_is_told_by_both_names(tmp_path: Path) -> None:
+    weights, config, made = load_policy(policy_file(NANO))
+    save_policy(tmp_path / "policy.pt", weights, config | {"family": "herd"}, made)
+    with pytest.raises(CheckpointError, match=r"policy\.pt has a configuration .*model\.family .*, got 'herd'"):
+        open_policy(tmp_path / "policy.pt")
 
 
 # --- what they are made of ------------------------------------------------------------------------------------------

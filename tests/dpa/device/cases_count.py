@@ -80,6 +80,12 @@ def test_a_tensor_of_the_host_is_refused_and_a_number_is_not(there: Pretended) -
     assert (value + torch.tensor(1.0)).tolist() == [2.0, 2.0, 2.0]
 
 
+def test_an_operator_that_only_gpus_have_is_named(there: Pretended) -> None:
+    cell, value = torch.nn.GRUCell(3, 3).to(DEVICE), torch.ones(1, 3, device=DEVICE)
+    with pytest.raises(RuntimeError, match=r"_thnn_fused_gru_cell.* is of GPUs alone"):
+        cell(value, value)
+
+
 def test_values_are_those_of_the_cpu_and_changes_in_place_are_seen_by_views(there: Pretended) -> None:
     value = torch.zeros(2, 3, device=DEVICE)
     row = value[1]
