@@ -19,7 +19,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException
 
 from dpa.training.distributed import started_ranks
 from dpa.training.loggers import check_backend
@@ -66,6 +66,9 @@ def ranked_recipe(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], 
             main(cfg)
         except MissingMandatoryValue as error:
             sys.exit(refused(f"{error.full_key} is not given; say {error.full_key}=VALUE (--help says more)."))
+        except (ConfigAttributeError, ConfigKeyError) as error:
+            lacks = f"there is no {error.full_key}: the YAML that should give it does not"
+            sys.exit(refused(f"{lacks} (that of a model begins with `defaults: [base]`)."))
         except USER_ERRORS as error:
             sys.exit(refused(error))
         except KeyboardInterrupt:
