@@ -103,10 +103,10 @@ def add(name: str, run: Path, evaluations: dict[str, Path], folder: Path = zoo.F
     if not re.fullmatch("[a-z0-9][a-z0-9._-]*", name):
         raise ValueError(f"a name in the zoo has small letters and digits, and - _ . after the first, got {name!r}.")
     place = folder / name
-    if place.exists():
+    if (place / zoo.CARD).exists():
         raise ValueError(f"the zoo has a policy {name!r} already; give another name, or remove {place} first.")
     card = make_card(run, evaluations)
-    place.mkdir(parents=True)
+    place.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(run / zoo.POLICY, place / zoo.POLICY)
     write_json(place / zoo.CARD, card)
     return place

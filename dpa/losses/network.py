@@ -86,7 +86,7 @@ def logits_under(parameters: TensorDictParams, network: TensorDictModule, batch:
     """
     with parameters.to_module(network):
         logits = network(batch.copy())[LOGITS]
-    check_logits(logits, batch[keys.TOKENS], f"{type(model_of(network)).__name__}.forward")
+    check_logits(logits, batch[keys.TOKENS], f"{type(getattr(network, 'module', network)).__name__}.forward")
     return logits
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import copy
+import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from dpa.models.actor import MotionActor
-from dpa.models.base import ContractError, MotionModel, check_logits
+from dpa.models.base import Choose, ContractError, Decision, Memory, MotionModel, Observation, check_logits
 from dpa.models.context import Context, Contexts, collate_contexts
 from dpa.tokens import TokenAction
 from envs import keys
@@ -35,7 +37,7 @@ ROLLOUTS, AGENTS, DECISIONS = 2, 3, 5
 def check_contract(model: MotionModel) -> None:
     """Drive a copy of a policy through two short roads, decision by decision, and ask it about all of them at once.
 
-    Weights of the copy are nudged, so that fresh ones say something too; neither the policy nor the global random
+    Matrices of the copy are nudged, so that fresh ones say something too; neither the policy nor the global random
     numbers change. A fraction of a second, for policies of up to some million parameters.
 
     Args:
@@ -61,69 +63,93 @@ def check_contract(model: MotionModel) -> None:
     if model.distribution.discrete and not tokenizer.vocab_size:
         raise ContractError(f"{name} predicts tokens of a vocabulary, and {type(tokenizer).__name__} has none.")
     rows = model.bytes_per_row()
-    if not isinstance(rows, int) or rows < 1:
+    if not isinstance(rows, Real) or rows < 1:
         raise ContractError(f"{name}.bytes_per_row must give a number of bytes, 1 or more, got {rows!r}.")
     options = EpisodeOptions(decision_steps=tokenizer.steps, horizon=min(DECISIONS, model.config.horizon))
-    scenes = [straight_road(AGENTS, seed=1), straight_road(AGENTS - 1, seed=2)]
-    with torch.random.fork_rng(), torch.no_grad():
+    agents = AGENTS + (options.horizon == AGENTS)
+    scenes = [straight_road(agents, seed=1), straight_road(agents - 1, seed=2)]
+    with torch.random.fork_rng(devices=[]), torch.no_grad():
         policy = _nudged(model)
         contexts = Contexts(scenes, policy.featurize, options)
-        context = _seen(contexts, name)
-        rolled = _driven(policy, scenes, contexts, options, name)
-        _compare(policy, context, rolled, name)
+        context = _seen(contexts, type(model))
+        rolled = _driven(policy, scenes, contexts, options)
+        _compare(policy, context, rolled)
 
 
 @contextmanager
-def _asked(method: str) -> Iterator[None]:
-    """Errors of a family's own code say which method they come from, and where."""
+def _asked(method: str, family: type[MotionModel]) -> Iterator[None]:
+    """Errors inside the block say which method they come from, and where in the family's own file, if they do."""
     try:
         yield
     except ContractError:
         raise
     except Exception as error:
-        last = traceback.extract_tb(error.__traceback__)[-1]
+        frames = traceback.extract_tb(error.__traceback__)
+        own = [frame for frame in frames if frame.filename == sys.modules[family.__module__].__file__]
+        last = (own or frames)[-1]
         place = f"{Path(last.filename).name}, line {last.lineno}"
         raise ContractError(f"{method} ends with {type(error).__name__}: {error} ({place}).") from error
 
 
+class _Watched:
+    """A memory whose errors are told as its own, and whose logits are numbers."""
+
+    def __init__(self, memory: Memory, family: type[MotionModel]) -> None:
+        self.memory, self.family, self.name = memory, family, f"the memory of {family.__name__}"
+
+    def begin(self, context: Context, rollouts: int, anew: bool) -> None:
+        with _asked(f"begin of {self.name}", self.family):
+            self.memory.begin(context, rollouts, anew)
+
+    def step(self, seen: Observation, choose: Choose) -> Decision:
+        def of_numbers(logits: Tensor, agents: Tensor | None = None) -> Tensor:
+            if not logits.isfinite().all():
+                raise ContractError(f"{self.name} chooses by logits that are not finite.")
+            return choose(logits, agents)
+
+        with _asked(f"step of {self.name}", self.family):
+            return self.memory.step(seen, of_numbers)
+
+
 def _nudged(model: MotionModel) -> MotionModel:
     policy, generator = copy.deepcopy(model).cpu().eval(), torch.Generator().manual_seed(0)
-    for parameter in policy.parameters():
+    for parameter in (each for each in policy.parameters() if each.dim() > 1):  # others may have to be positive
         parameter.add_(NUDGE * torch.randn(parameter.shape, generator=generator))
     return policy
 
 
-def _seen(contexts: Contexts, name: str) -> Context:
+def _seen(contexts: Contexts, family: type[MotionModel]) -> Context:
     """What the policy sees of both scenes."""
-    with _asked(f"{name}.featurize"):
+    with _asked(name := f"{family.__name__}.featurize", family):
         each = [contexts[index] for index in range(len(contexts))]
         if not is_tensorclass(each[0]) or not hasattr(each[0], "episode") or not hasattr(each[0], "of_agents"):
             raise ContractError(
-                f"{name}.featurize must give a TensorClass with the field episode and the class variable of_agents, "
+                f"{name} must give a TensorClass with the field episode and the class variable of_agents, "
                 f"got {type(each[0]).__name__}."
             )
         return collate_contexts(each)
 
 
-def _driven(
-    policy: MotionModel, scenes: list[Scene], contexts: Contexts, options: EpisodeOptions, name: str
-) -> TensorDictBase:
+def _driven(policy: MotionModel, scenes: list[Scene], contexts: Contexts, options: EpisodeOptions) -> TensorDictBase:
+    family = type(policy)
     env = TrafficEnv(scenes, options, num_scenes=len(scenes), num_rollouts=ROLLOUTS)
     env = TransformedEnv(env, TokenAction(policy.tokenizer))
-    with _asked(f"{name}.remember"):
+    with _asked(f"{family.__name__}.remember", family):
         actor = MotionActor(policy, contexts, num_rollouts=ROLLOUTS)
-    with _asked(f"the memory of {name}"):
+        actor._memory = _Watched(actor._memory, family)
+    with _asked(f"driving by tokens of {type(policy.tokenizer).__name__}", type(policy)):
         return env.rollout(options.horizon, actor)
 
 
-def _compare(policy: MotionModel, context: Context, rolled: TensorDictBase, name: str) -> None:
+def _compare(policy: MotionModel, context: Context, rolled: TensorDictBase) -> None:
     """What the policy said decision by decision is what it says of the whole."""
 
     def by_scene(key: Any) -> Tensor:
         return rolled[key].transpose(1, 2).unflatten(0, (-1, ROLLOUTS))
 
+    name = type(policy).__name__
     tokens, controlled = by_scene(keys.TOKEN), context.episode.controlled[:, None, :, None]
-    with _asked(f"{name}.forward"):
+    with _asked(f"{name}.forward", type(policy)):
         logits = policy(context, tokens, controlled.expand(*controlled.shape[:3], tokens.shape[3]))
         check_logits(logits, tokens, f"{name}.forward", policy.tokenizer.vocab_size or None)
     acted = by_scene(keys.CONTROLLED)

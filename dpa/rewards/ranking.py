@@ -38,9 +38,10 @@ class RealismRanking:
         tensor(2)
     """
 
-    metric: str = YEAR
+    metric: str | int = YEAR
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "metric", str(self.metric))  # a command line says 2025
         judge(self.metric)
 
     def describe(self) -> dict[str, Any]:

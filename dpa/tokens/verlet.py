@@ -79,6 +79,8 @@ class VerletTokenizer(MotionTokenizer):
         frame: Frame = "current",
     ) -> None:
         super().__init__()
+        if steps < 1:
+            raise ValueError(f"steps must be 1 or more poses of 0.1 s, got {steps}.")
         if interpolation not in ("linear", "quadratic"):
             raise ValueError(f"interpolation must be 'linear' or 'quadratic', got {interpolation!r}.")
         if frame not in ("current", "scene"):

@@ -67,8 +67,10 @@ def ranked_recipe(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], 
         except MissingMandatoryValue as error:
             sys.exit(refused(f"{error.full_key} is not given; say {error.full_key}=VALUE (--help says more)."))
         except (ConfigAttributeError, ConfigKeyError) as error:
-            lacks = f"there is no {error.full_key}: the YAML that should give it does not"
-            sys.exit(refused(f"{lacks} (that of a model begins with `defaults: [base]`)."))
+            base = (
+                " (that of a model begins with `defaults: [base]`)" if str(error.full_key).startswith("model") else ""
+            )
+            sys.exit(refused(f"there is no {error.full_key}: the YAML that should give it does not{base}."))
         except USER_ERRORS as error:
             sys.exit(refused(error))
         except KeyboardInterrupt:

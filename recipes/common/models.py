@@ -58,6 +58,8 @@ def episode_options(cfg: DictConfig) -> EpisodeOptions:
     if "decision_steps" in cfg.episode:
         raise ValueError("model.episode has no option 'decision_steps': a decision lasts as long as a token.")
     steps = build_tokenizer(tokenizer_config(cfg)).steps
+    if steps < 1:
+        raise ValueError(f"model.tokenizer ({cfg.tokenizer.name}): a token has 1 pose or more, got steps={steps}.")
     horizon = EPISODE_STEPS // steps if cfg.episode.horizon is None else cfg.episode.horizon
     told = OmegaConf.merge(cfg.episode, {"horizon": horizon})
     return build(EpisodeOptions, told, "model.episode", decision_steps=steps)

@@ -54,7 +54,9 @@ def open_splits(cfg: DictConfig) -> Splits:
     """
     drawn = isinstance(cfg.tune, int)
     for split in ("train", "eval") if drawn else ("train", "tune", "eval"):
-        _find(cfg, split)  # all that is named is there before any of it is converted, which can take hours
+        inputs = _named(cfg, split)
+        if cfg.source in SOURCES:  # all of it is there before any is converted, which can take hours
+            SOURCES[cfg.source].find(inputs)
     train, held_out = (_chosen(_open(cfg, split), cfg.select, split) for split in ("train", "eval"))
     if drawn:
         train, tune = _drawn(train, cfg.tune, cfg.split_seed)
@@ -94,20 +96,17 @@ def _chosen(scenes: SceneStore, select: DictConfig, split: str) -> SceneStore:
     return chosen
 
 
-def _find(cfg: DictConfig, split: str) -> list[str]:
-    """What the user named, which is there."""
+def _named(cfg: DictConfig, split: str) -> list[str]:
+    """What the user named."""
     paths = cfg[split]
     if not isinstance(paths, str | ListConfig):
         number = "a number of training scenes, " if split == "tune" else ""
         raise ValueError(f"scenes.{split} must be {number}a path or a list of paths, got {paths!r}.")
-    inputs = [paths] if isinstance(paths, str) else list(paths)
-    if cfg.source in SOURCES:
-        SOURCES[cfg.source].find(inputs)
-    return inputs
+    return [paths] if isinstance(paths, str) else list(paths)
 
 
 def _open(cfg: DictConfig, split: str) -> SceneStore:
-    inputs = _find(cfg, split)
+    inputs = _named(cfg, split)
     if cfg.source == "store":
         return SceneStore(*inputs)
     name = hashlib.sha256("\n".join([f"{cfg.source} {FORMAT_VERSION}", *inputs]).encode()).hexdigest()[:12]

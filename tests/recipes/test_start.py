@@ -68,7 +68,7 @@ def test_a_start_with_other_tokens_or_another_size_is_refused(
 def test_a_start_that_is_no_policy_is_refused(run: Callable, options: Callable, stores: Path, tmp_path: Path) -> None:
     torn = tmp_path / "torn.pt"
     torn.write_bytes(b"PK\x03\x04 torn")
-    for start, told in ((torn, "torn.pt"), ("zoo:motionlm-nano-sum", "did you mean zoo:motionlm-nano-sumo?")):
+    for start, told in ((torn, "torn.pt"), ("zoo:motionlm-nano-sum", "Did you mean zoo:motionlm-nano-sumo?")):
         outcome = run("pretrain", *elsewhere(options, stores, start, tmp_path / "run"))
         assert outcome.status == 2 and told in outcome.err, outcome.err
 

@@ -80,7 +80,7 @@ MISTAKES = {
     ),
     "a memory without steps": (
         lambda: altered(remember=lambda self, *, compile=False: object()),
-        r"the memory of Odd ends with AttributeError: .*'begin'",
+        r"begin of the memory of Odd ends with AttributeError: .*'begin'",
     ),
     "a dictionary of what is seen": (
         lambda: altered(featurize=property(lambda self: lambda scene, episode: {"episode": episode})),
@@ -110,6 +110,47 @@ def test_every_family_keeps_the_contract_and_is_left_as_it_was(family: str, make
     check_contract(model)
     assert model.training and torch.equal(torch.get_rng_state(), drawn)
     assert all(torch.equal(one, other) for one, other in zip(before, model.state_dict().values(), strict=True))
+
+
+class Scaled(Odd):
+    """Has a parameter that must stay positive, and agrees with itself."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.spread = torch.nn.Parameter(torch.tensor([0.03]))
+
+    def forward(self, *given: Any) -> Tensor:
+        return super().forward(*given) * self.spread.sqrt()
+
+    def remember(self, *, compile: bool = False) -> Any:
+        memory = super().remember(compile=compile)
+
+        def step(seen: Any, choose: Callable) -> Decision:
+            token, logits = memory.step(seen, lambda logits, agents=None: choose(logits * self.spread.sqrt(), agents))
+            return Decision(token, logits * self.spread.sqrt())
+
+        return SimpleNamespace(begin=memory.begin, step=step)
+
+
+def test_a_parameter_that_must_be_positive_stays_so() -> None:
+    check_contract(Scaled())
+
+
+def test_logits_that_are_not_finite_are_told_as_such() -> None:
+    model = Scaled()
+    with torch.no_grad():
+        model.spread.fill_(-1.0)
+    with pytest.raises(ContractError, match="the memory of Scaled chooses by logits that are not finite"):
+        check_contract(model)
+
+
+def test_an_error_of_the_tokenizer_is_not_told_as_the_memorys() -> None:
+    class Broken(VerletTokenizer):
+        def decode(self, *given: Tensor) -> Tensor:
+            raise RuntimeError("no motion")
+
+    with pytest.raises(ContractError, match="driving by tokens of Broken ends with RuntimeError: no motion"):
+        check_contract(MotionLM("nano", Broken()))
 
 
 def test_a_policy_of_tokens_needs_a_vocabulary() -> None:
