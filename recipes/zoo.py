@@ -24,7 +24,7 @@ from rich.table import Table
 
 from dpa import zoo
 from dpa.report.experiment import read_json
-from dpa.report.table import print_whole
+from dpa.report.table import MISSING, number, print_whole
 from dpa.training.checkpoint import load_policy
 from dpa.training.run import seconds_trained
 from envs.files import write_json
@@ -122,14 +122,12 @@ def listed() -> Table:
         for measure in SHOWN:
             table.add_column(f"{kind}\n{measure.replace('_', ' ')}", justify="right")
     for name, card in cards.items():
-        measured = [card["measures"].get(kind, {"mean": {}, "scenes": "–"}) for kind in kinds]
-        cells = [cell for each in measured for cell in (str(each["scenes"]), *(_shown(each["mean"], m) for m in SHOWN))]
+        measured = [card["measures"].get(kind, {"mean": {}, "scenes": MISSING}) for kind in kinds]
+        cells = []
+        for each in measured:
+            cells += [str(each["scenes"]), *(number(each["mean"].get(measure), 3) for measure in SHOWN)]
         table.add_row(name, f"{card['parameters']:,}", f"{card['hours']:.1f}", *cells)
     return table
-
-
-def _shown(mean: dict[str, float | None], measure: str) -> str:
-    return "–" if mean.get(measure) is None else f"{mean[measure]:.3f}"
 
 
 def _named(text: str) -> tuple[str, Path]:

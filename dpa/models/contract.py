@@ -137,7 +137,7 @@ def _driven(policy: MotionModel, scenes: list[Scene], contexts: Contexts, option
     with _asked(f"{family.__name__}.remember", family):
         actor = MotionActor(policy, contexts, num_rollouts=ROLLOUTS)
         actor._memory = _Watched(actor._memory, family)
-    with _asked(f"driving by tokens of {type(policy.tokenizer).__name__}", type(policy)):
+    with _asked(f"driving by tokens of {type(policy.tokenizer).__name__}", family):
         return env.rollout(options.horizon, actor)
 
 

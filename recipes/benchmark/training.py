@@ -78,8 +78,8 @@ def measure(options: dict[str, Any]) -> list[dict[str, Any]]:
         ValueError: a number that cannot be, or a checkout without the recipe.
         OSError: a training ended with an error.
     """
-    for name, least in (("agents", 1), ("cores", 1), ("scenes", BATCH), ("epochs", 2), ("repeats", 1)):
-        if options[name] < least:
+    for name, least in (("agents", 1), ("pieces", 1), ("cores", 1), ("scenes", BATCH), ("epochs", 2), ("repeats", 1)):
+        if options[name] is not None and options[name] < least:
             raise ValueError(f"--{name} must be {least} or more, got {options[name]}.")
     here = [(HERE, precision) for precision in options["precision"] or [None]]
     checkouts = [*here, *([(Path(options["against"]).absolute(), None)] if options["against"] else [])]
