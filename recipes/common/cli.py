@@ -11,7 +11,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from inspect import Parameter, signature
+from inspect import Parameter
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from dpa.training.distributed import started_ranks
 from dpa.training.loggers import check_backend
 from envs.allocator import keep_freed_memory
 from envs.options import differences
-from recipes.common.kinds import check_kinds
+from recipes.common.kinds import check_kinds, taken_by
 from recipes.common.limits import check_added, check_limits
 
 CONFIG = {"version_base": "1.3", "config_path": str(Path(__file__).parents[1] / "config")}
@@ -168,14 +168,15 @@ def build(target: Callable[..., Any], section: DictConfig, name: str, *args: Any
         ValueError: a key that the target does not take, one that it lacks, or a value of another kind than it says; the
             message names both.
     """
-    options = plain(section)
-    parameters = signature(target).parameters.values()
-    known = [p.name for p in parameters if p.kind in (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)]
+    options, takes = plain(section), taken_by(target)
+    known = [
+        p.name for p in takes.parameters.values() if p.kind in (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
+    ]
     unknown = sorted(set(options) - set(known))
     if unknown:
         raise ValueError(f"{name} has no option {unknown[0]!r}; it takes {', '.join(known)}.")
     try:
-        signature(target).bind(*args, **options, **fixed)
+        takes.bind(*args, **options, **fixed)
     except TypeError as error:
         raise ValueError(f"{name} {error}.") from None
     check_kinds(target, options, name.partition(" (")[0])

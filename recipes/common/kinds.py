@@ -4,13 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from inspect import isclass, isfunction, signature
+from inspect import Signature, isclass, isfunction, signature
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from recipes.common.limits import LISTS, WORDS, is_number
 
 SCALARS = (int, float, bool, str, NoneType)
+
+
+def taken_by(target: Callable[..., Any]) -> Signature:
+    """What a function or class is called with.
+
+    Python before 3.11.4 takes it from the ``__new__`` of a base where a class inherits its ``__init__``, as losses do.
+
+    Examples:
+        >>> from dpa.losses import PlackettLuceLoss
+        >>> "alpha" in taken_by(PlackettLuceLoss).parameters
+        True
+    """
+    if not (isclass(target) and isfunction(target.__init__)):
+        return signature(target)
+    _, *taken = signature(target.__init__).parameters.values()
+    return Signature(taken)
 
 
 def check_kinds(target: Callable[..., Any], options: Mapping[str, Any], name: str) -> None:
@@ -39,7 +55,7 @@ def check_kinds(target: Callable[..., Any], options: Mapping[str, Any], name: st
         ...
         ValueError: model.context.bins.vehicle must be a list of 2 numbers, got [0.3].
     """
-    hints, known = _hints(target), signature(target).parameters
+    hints, known = _hints(target), taken_by(target).parameters
     for option, value in options.items():
         if option in hints and not (option in known and _same(value, known[option].default)):
             _check(value, hints[option], f"{name}.{option}")
