@@ -3,7 +3,9 @@
 python -m recipes.ladder scenes=gpudrive scenes.train=DIR scenes.eval=DIR policies=[runs/pretrain/policy.pt]
 
 A metric that is worth trusting puts the rungs in their order. Run the same command again to go on after a kill: rungs
-that are there are read back.
+that are there are read back. Of scenes from SUMO, ``simulator=true`` adds what SUMO itself does when it goes on from
+the current step: what the logs were drawn from, by one who knows all drivers, and everybody's way or only what can be
+seen of it.
 """
 
 from __future__ import annotations
@@ -18,18 +20,29 @@ import numpy as np
 from omegaconf import DictConfig
 from torch import Tensor
 
+from dpa.ranking import agent_spread
 from dpa.realism import CLASS_RATES, RealismConfig, class_rates, realism
 from dpa.report.statistics import summary
 from dpa.training.seeding import seed_everything
 from envs.files import write_json
 from envs.scene import Scene, SceneSource
 from envs.seeding import make_generator
+from envs.sources.sumo.futures import Keeps
+from envs.store import SceneStore
 from recipes.common.cli import CONFIG, finite, mean_known, plain, recipe
 from recipes.common.models import episode_options, fresh_policy, open_policy, policies_of, policy_config, weights_digest
 from recipes.common.rolled import Rolls, driven
 from recipes.common.scenes import fingerprint, open_splits
 from recipes.studies.rows import looked_at, read_or_score
-from recipes.studies.rungs import Rung, constant_velocity, logged, noisy_log, random_tokens, tokenized_log
+from recipes.studies.rungs import (
+    Rung,
+    Simulator,
+    constant_velocity,
+    logged,
+    noisy_log,
+    random_tokens,
+    tokenized_log,
+)
 from recipes.studies.tables import StudyTable, tell
 
 BESIDES = {
@@ -37,8 +50,15 @@ BESIDES = {
     "collision_rate": "collision",
     **{name: name.replace("_", " ") for name in CLASS_RATES},
     "offroad_rate": "off-road",
+    "spread": "spread [m]",
 }
 """What is told beside realism; of a class, over the scenes that evaluate somebody of it."""
+SIMULATOR: dict[str, Keeps] = {
+    "SUMO again": "all",
+    "SUMO, other random numbers": "ways",
+    "SUMO, other ways too": "drivers",
+}
+"""Rungs of SUMO itself, and what each keeps of the log."""
 FIGURES = ("realism", "kinematic", "interactive", "map_based", *BESIDES)
 """What is kept of every scene."""
 
@@ -55,7 +75,8 @@ def score_rung(scenes: SceneSource, rollouts: Rolls, metrics: Mapping[str, Reali
 
 def _figures(scene: Scene, poses: Tensor, metric: RealismConfig) -> dict[str, float]:
     result = realism(scene, poses, metric, features=True)
-    return result.as_dict() | class_rates(result.features, metric)
+    spread = agent_spread(poses[:, scene.agents.evaluated[scene.agents.present]]).mean().item()
+    return result.as_dict() | class_rates(result.features, metric) | {"spread": spread}
 
 
 def crude(scenes: SceneSource, rung: Rung, num_rollouts: int, seed: int) -> Rolls:
@@ -64,9 +85,10 @@ def crude(scenes: SceneSource, rung: Rung, num_rollouts: int, seed: int) -> Roll
         yield index, rung(scenes[index], num_rollouts, make_generator(seed, "ladder", index))
 
 
-def rungs(cfg: DictConfig, scenes: SceneSource) -> Iterator[tuple[str, dict[str, Any], Rolls]]:
+def rungs(cfg: DictConfig, scenes: SceneStore) -> Iterator[tuple[str, dict[str, Any], Rolls]]:
     """Name, what decides it, and rollouts of each rung, from the best to expect to the worst."""
     count, seed = cfg.num_rollouts, cfg.seed
+    sumo = Simulator(scenes, count, seed) if cfg.simulator else None
     config = policy_config(cfg.model)
     seed_everything(seed)
     untrained = fresh_policy(cfg.model)
@@ -84,11 +106,15 @@ def rungs(cfg: DictConfig, scenes: SceneSource) -> Iterator[tuple[str, dict[str,
         made["random tokens"] = random_tokens(untrained.tokenizer)
     for name, rung in made.items():
         yield name, {"tokenizer": config["tokenizer"]}, crude(scenes, rung, count, seed)
+    for name, keeps in SIMULATOR.items() if sumo is not None else ():
+        yield name, {}, sumo.goes_on(keeps)
+        told = {"tokenizer": config["tokenizer"]}
+        yield f"{name}, through tokens", told, sumo.goes_on(keeps, untrained.tokenizer)
     for name, (model, episode, config) in models.items():
         yield name, decoding | {"policy": weights_digest(model), **config}, driven(scenes, model, episode, cfg)
 
 
-def climb(cfg: DictConfig, scenes: SceneSource) -> dict[str, dict]:
+def climb(cfg: DictConfig, scenes: SceneStore) -> dict[str, dict]:
     """Score every rung, or read it back; ``{rung: {year: {figure: one value per scene}}}``.
 
     Raises:

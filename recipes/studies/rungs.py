@@ -1,4 +1,4 @@
-"""Rollouts that need no policy: the log itself, through tokens or with noise, constant velocity, random tokens."""
+"""Rollouts that need no policy: the log, through tokens or with noise, constant velocity, random tokens, and SUMO."""
 
 from __future__ import annotations
 
@@ -10,6 +10,10 @@ from torch import Tensor
 from dpa.rollout import lifted
 from dpa.tokens import MotionTokenizer
 from envs.scene import CURRENT_STEP, STEP_SECONDS, Scene
+from envs.seeding import make_generator
+from envs.sources.sumo.futures import Keeps, futures
+from envs.store import SceneStore
+from recipes.common.rolled import Rolls
 
 Rung = Callable[[Scene, int, torch.Generator], Tensor]
 """Scene, number of rollouts and generator -> ``[R, A, 80, 4]``."""
@@ -56,12 +60,53 @@ def tokenized_log(tokenizer: MotionTokenizer) -> Rung:
     """The log through tokens and back, in every rollout: the best that any model of these tokens could do alike."""
 
     def roll(scene: Scene, num_rollouts: int, generator: torch.Generator) -> Tensor:
-        recent, kind = _seen(scene, tokenizer.steps)
-        poses = _log(scene)[..., [0, 1, 3]]
-        tracks = tokenizer.encode_tracks(poses, torch.ones(poses.shape[:2], dtype=torch.bool), recent, kind)
-        return lifted(scene, tracks.poses[None]).expand(num_rollouts, -1, -1, -1)
+        poses = through(tokenizer, scene, _log(scene)[None, ..., [0, 1, 3]])
+        return lifted(scene, poses).expand(num_rollouts, -1, -1, -1)
 
     return roll
+
+
+def through(tokenizer: MotionTokenizer, scene: Scene, poses: Tensor) -> Tensor:
+    """Tracks ``[R, A, 80, 3]`` of the present agents, through tokens and back."""
+    recent, kind = _seen(scene, tokenizer.steps)
+    valid = torch.ones(poses.shape[:-1], dtype=torch.bool)
+    recent = recent.expand(len(poses), -1, -1, -1)
+    return tokenizer.encode_tracks(poses, valid, recent, kind.expand(len(poses), -1)).poses
+
+
+class Simulator:
+    """SUMO going on from every scene's current step: what its logs were drawn from (:mod:`envs.sources.sumo.futures`).
+
+    Args:
+        scenes: of SUMO.
+        num_rollouts: R, futures of each scene.
+        seed: of all that is drawn.
+
+    Raises:
+        ValueError: scenes of another source.
+    """
+
+    def __init__(self, scenes: SceneStore, num_rollouts: int, seed: int) -> None:
+        if sources := sorted({each["source"] for each in scenes.origins()} - {"sumo"}):
+            raise ValueError(f"simulator=true needs scenes that SUMO has simulated, got some of {', '.join(sources)}.")
+        self.scenes, self.num_rollouts, self.seed = scenes, num_rollouts, seed
+        self._made: dict[tuple[int, Keeps], Tensor] = {}
+
+    def goes_on(self, keeps: Keeps, tokenizer: MotionTokenizer | None = None) -> Rolls:
+        """Its futures, through tokens and back where some are given."""
+        for index in range(len(self.scenes)):
+            scene, poses = self.scenes[index], self._futures(index, keeps)
+            poses = poses if tokenizer is None else through(tokenizer, scene, poses)
+            yield index, lifted(scene, poses).expand(self.num_rollouts, -1, -1, -1)
+
+    def _futures(self, index: int, keeps: Keeps) -> Tensor:
+        """Simulated once, however many rungs ask; one alone where nothing is drawn."""
+        if (index, keeps) not in self._made:
+            scene, count = self.scenes[index], 1 if keeps == "all" else self.num_rollouts
+            draw = make_generator(self.seed, "simulator", scene.scene_id)
+            seeds = torch.randint(2**31 - 1, (count,), generator=draw).tolist()
+            self._made[index, keeps] = futures(self.scenes.provenance(index)[0], scene, seeds, keeps=keeps)
+        return self._made[index, keeps]
 
 
 def _seen(scene: Scene, steps: int) -> tuple[Tensor, Tensor]:

@@ -36,12 +36,14 @@ from envs.sources import sumo
 from envs.sources.sumo.classes import CLASSES
 from envs.sources.sumo.cut import cut_map
 from envs.sources.sumo.demand import draw_types
+from envs.sources.sumo.futures import futures
 from envs.sources.sumo.makers import make_network
 from envs.sources.sumo.netmap import GUTTER, NetMap, build_map
 from envs.sources.sumo.network import NetConnection, NetEdge, NetLane, Network, read_network, run_sumo, sumo_binary
 from envs.sources.sumo.options import settings as sumo_settings
 from envs.sources.sumo.tracks import make_tracks, smooth, trail
 from envs.sources.sumo.traffic import Recording
+from envs.sources.sumo.ways import Driver, can_take, draw_ways, possible_ways
 
 shapely = pytest.importorskip("shapely", reason="needs the extra `sumo`")
 pytest.importorskip("sumolib", reason="needs the extra `sumo`")
@@ -683,6 +685,122 @@ def test_a_ring_inside_the_region_stays_closed(straight_map: NetMap) -> None:
     assert torch.equal(ring[0], ring[-1]) and len(begun) == 5
 
 
+# --- other futures ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def resumed() -> tuple[sumo.SumoUnit, Scene]:
+    """A simulation with vehicles, cyclists and pedestrians, and its scene."""
+    (unit,) = sumo.units(1, seed=3, preset="grid", windows=1, density=1.5)
+    (scene,) = sumo.simulate(unit)
+    return unit, scene
+
+
+def poses_ahead(scene: Scene) -> tuple[torch.Tensor, torch.Tensor]:
+    """Logged places ``[A, 80, 2]`` of the present agents, and whether they are known."""
+    agents = scene.agents
+    ahead = slice(CURRENT_STEP + 1, LOG_STEPS)
+    return agents.position[agents.present, ahead, :2], agents.valid[agents.present, ahead]
+
+
+def test_with_its_own_random_numbers_a_simulation_goes_on_as_its_log_does(resumed: tuple) -> None:
+    unit, scene = resumed
+    (again,) = futures(unit.text, scene, [0], keeps="all")
+    log, valid = poses_ahead(scene)
+    away = ((again[..., :2] - log).norm(dim=-1) * valid).amax(-1)
+    assert len(away) >= 12 and away.quantile(0.7) < 0.3  # the others waited, which SUMO does not save
+    kinds = scene.agents.kind[scene.agents.present]
+    assert {int(kind) for kind in kinds[away < 0.3]} >= {int(AgentKind.VEHICLE), int(AgentKind.PEDESTRIAN)}
+
+
+def test_a_seed_makes_a_future_and_another_one_another(resumed: tuple) -> None:
+    unit, scene = resumed
+    some = futures(unit.text, scene, [1, 2, 1])
+    assert torch.equal(some[0], some[2]) and not torch.equal(some[0], some[1])
+    assert futures(unit.text, scene, [2])[0].equal(some[1])
+
+
+def test_a_future_begins_where_the_scene_is_and_moves_as_its_log_does(resumed: tuple) -> None:
+    unit, scene = resumed
+    agents, some = scene.agents, futures(unit.text, scene, [1, 2])
+    now = torch.cat((agents.position[..., :2], agents.heading[..., None]), -1)[agents.present, CURRENT_STEP]
+    path = torch.cat((now.expand(2, -1, -1)[:, :, None], some), 2)
+    speed = path[..., :2].diff(dim=2).norm(dim=-1) / STEP_SECONDS
+    on_foot = agents.kind[agents.present] == AgentKind.PEDESTRIAN
+    assert speed[:, on_foot, 1:].max() < 4.0  # SUMO's saved state lets them run at 10 m/s
+    assert (speed[..., 0] - agents.velocity[agents.present, CURRENT_STEP].norm(dim=-1)).abs().max() < 4.0
+    assert some[..., 2].abs().max() <= np.pi + 1e-6
+
+
+def test_who_leaves_the_network_stays_where_it_was_last() -> None:
+    (unit,) = sumo.units(1, seed=3, preset="roundabout", windows=1, warmup=15.0, radius=150.0, max_agents=60)
+    (scene,) = sumo.simulate(unit)
+    (some,) = futures(unit.text, scene, [1])
+    _, valid = poses_ahead(scene)
+    gone = ~valid[:, -40]  # four seconds before the end
+    assert gone.any()
+    still = (some[gone, -1, :2] - some[gone, -2, :2]).norm(dim=-1) == 0
+    assert still.float().mean() > 0.8 and some.isfinite().all()
+
+
+def test_ways_that_a_driver_may_be_on_begin_as_its_own_and_go_on_from_its_lane(tmp_path: Path) -> None:
+    (unit,) = sumo.units(1, seed=3, preset="grid", windows=1, density=1.5)
+    _, run = sumo.prepared(unit, tmp_path)
+    saved = {"save-state.times": 31.0, "save-state.files": tmp_path / "state.xml"}
+    sumo.recorded(unit, replace(run, options=saved), tmp_path)
+    state = ElementTree.parse(tmp_path / "state.xml").getroot()
+    routes = {route.get("id"): tuple(route.get("edges").split()) for route in state.iter("route")}
+    own = {each.get("id"): routes[each.get("route")] for each in state.iter("vehicle")}
+    here = {each.get("id"): int(each.get("state").split()[2]) for each in state.iter("vehicle")}
+    possible = possible_ways(state, own, run.network, run.routes, False, tmp_path)
+    assert len(possible) > 50 and sum(len(ways) > 1 for ways in possible.values()) > len(possible) / 2
+    for name, ways in possible.items():
+        assert own[name] in ways and sum(ways.values()) == pytest.approx(1)
+        behind = own[name][: here[name] + 1]
+        assert all(way[: len(behind)] == behind for way in ways)
+    draw_ways(state, possible, np.random.default_rng(0))
+    drawn = {route.get("id"): tuple(route.get("edges").split()) for route in state.iter("route")}
+    driven = {each.get("id"): drawn[each.get("route")] for each in state.iter("vehicle")}
+    assert all(driven[name] in ways for name, ways in possible.items())
+    assert 0 < sum(driven[name] == own[name] for name in possible) < len(possible)
+
+
+def test_a_driver_takes_only_turns_that_its_lane_allows(tmp_path: Path) -> None:
+    def lane(name: str, index: int) -> NetLane:
+        shape = np.array([[0.0, 0.0], [100.0, 0.0]])
+        return NetLane(f"{name}_{index}", name, index, "vehicle", "street", 3.2, 10.0, shape)
+
+    joins = (("in_0", "right_0"), ("in_1", "left_0"))
+    leads = {(source, target.rsplit("_", 1)[0]) for source, target in joins}
+    for index, allowed in ((0, "right"), (1, "left")):
+        driver = Driver("1", ("in", allowed), 0, lane("in", index).lane_id)
+        ways = [way for way in (("in", "left"), ("in", "right")) if can_take(driver, way, leads)]
+        assert ways == [("in", allowed)]
+    about_to_change = Driver("1", ("in", "left"), 0, "in_0")
+    assert can_take(about_to_change, ("in", "left"), leads)
+    assert not can_take(about_to_change, ("in", "right"), leads)
+
+
+def test_other_ways_make_other_futures(resumed: tuple) -> None:
+    unit, scene = resumed
+    same, other = (futures(unit.text, scene, [1, 2], keeps=keeps) for keeps in ("ways", "drivers"))
+    assert not torch.equal(same, other)
+    assert torch.equal(other[1], futures(unit.text, scene, [2], keeps="drivers")[0])
+
+
+def test_ways_of_traffic_of_ones_own_cannot_be_drawn() -> None:
+    scene = next(sumo.generate(1, seed=5, preset="town", windows=1, warmup=10.0))
+    with pytest.raises(ValueError, match="only random traffic says which ways are possible"):
+        futures("net=a.net.xml,routes=a.rou.xml,number=0,num_scenes=1", scene, [0], keeps="drivers")
+
+
+def test_a_scene_of_another_simulation_has_no_future_in_this_one(resumed: tuple) -> None:
+    unit, scene = resumed
+    other = replace(unit, number=unit.number + 1)
+    with pytest.raises(ValueError, match=rf"{scene.scene_id}: the simulation .*number={other.number}.* other traffic"):
+        futures(other.text, scene, [0])
+
+
 # --- from bumpers to boxes -------------------------------------------------------------------------------------------
 
 
@@ -690,6 +808,7 @@ def record(front: np.ndarray, angle: float, speed: float, length: float = 4.0) -
     """One car."""
     steps = len(front)
     return Recording(
+        names=["0"],
         kind=np.array([int(AgentKind.VEHICLE)]),
         is_car=np.array([True]),
         extent=np.array([[length, 1.8, 1.5]]),

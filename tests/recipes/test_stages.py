@@ -33,6 +33,7 @@ from dpa.training.distributed import Ranks
 from dpa.training.loggers import read_curve
 from dpa.training.optim import accumulate_gradients, clip_and_step
 from envs import keys
+from envs.convert import convert
 from envs.scene import CURRENT_STEP
 from envs.sources.synthetic import straight_road
 from envs.store import SceneStore
@@ -53,6 +54,7 @@ from recipes.common.scenes import open_splits
 from recipes.evaluate import FIGURES, final_spread, standing_moved
 from recipes.experiment.jobs import align_job
 from recipes.experiment.pool import Job, Workers
+from recipes.ladder import SIMULATOR
 from recipes.pretrain import tuning_items
 
 METHODS = ("dpa_omf", "dpa_adef", "sft_best_oa", "sft_best_ade", "adversarial_afd")
@@ -1089,6 +1091,23 @@ def test_the_ladder_has_its_rungs_in_order_and_reads_them_back(
     assert all(rate is None or 0 <= rate <= 1 for rate in rates) and set(rates) != {None}
     content = out.read_text()
     assert "log" in run("ladder", *command).out and out.read_text() == content
+
+
+def test_the_ladder_of_simulated_scenes_has_rungs_of_the_simulator(
+    run: Callable, options: Callable, tmp_path: Path
+) -> None:
+    pytest.importorskip("sumolib", reason="needs the extra `sumo`")
+    convert("sumo", ["num_scenes=1,windows=1,warmup=15,density=1.5,scenes_per_unit=1"], tmp_path / "traffic")
+    out, rungs_of_sumo = tmp_path / "ladder.json", [*SIMULATOR, *(f"{name}, through tokens" for name in SIMULATOR)]
+    command = options("ladder", "simulator=true", "num_rollouts=4", "years=['2024']", f"json={out}")
+    outcome = run("ladder", *command, f"scenes.eval={tmp_path / 'traffic'}", f"output={tmp_path / 'ladder'}")
+    assert outcome.status == 0, outcome.err
+    found = {name: years["2024"] for name, years in json.loads(out.read_text())["rungs"].items()}
+    (spread,) = zip(*(found[name]["spread"] for name in SIMULATOR), strict=True)
+    assert spread[0] == 0 < spread[1] < spread[2], "what is known of the log narrows its futures"
+    assert set(rungs_of_sumo) < set(found) and found["SUMO again"]["min_ade"][0] < 0.5
+    refused = run("ladder", *command, f"output={tmp_path / 'roads'}")
+    assert refused.status == 2 and "simulator=true needs scenes that SUMO has simulated" in refused.err
 
 
 # --- play -----------------------------------------------------------------------------------------------------------

@@ -44,7 +44,20 @@ from envs.sources.sumo.own import own_network, read_routes, stem
 from envs.sources.sumo.tracks import Tracks, make_tracks
 from envs.sources.sumo.traffic import Recording, Run, simulate_traffic
 
-__all__ = ["SPLITS", "SUMO", "SumoUnit", "generate", "make_options", "parse", "simulate", "units"]
+__all__ = [
+    "SPLITS",
+    "SUMO",
+    "SumoUnit",
+    "exits_by_lane",
+    "generate",
+    "make_options",
+    "parse",
+    "prepared",
+    "read_unit",
+    "recorded",
+    "simulate",
+    "units",
+]
 
 SPLITS = ("train", "tune", "test")
 """Names of the splits; the place of a name sets the range of its unit numbers."""
@@ -176,7 +189,8 @@ def simulate(unit: SumoUnit) -> list[Scene]:
     """
     sumo_binary("sumo")
     with tempfile.TemporaryDirectory(prefix="sumo_") as folder:
-        road, recording = _own(unit, Path(folder)) if unit.net else _random(unit, Path(folder))
+        road, run = prepared(unit, Path(folder))
+        recording = recorded(unit, run, Path(folder))
     tracks = make_tracks(recording)
     scenes: list[Scene] = []
     for start, sdc in _turns(unit, tracks):
@@ -192,12 +206,49 @@ def simulate(unit: SumoUnit) -> list[Scene]:
     )
 
 
-def _random(unit: SumoUnit, folder: Path) -> tuple[NetMap, Recording]:
-    """A random network with random traffic."""
+def exits_by_lane(unit: SumoUnit) -> bool:
+    """In a simulation's random traffic, a way out is as likely as it has lanes."""
+    rules = settings()["presets"][unit.preset] if unit.preset else settings()["own_network"]
+    return rules["traffic"].get("inflow_per", "street") == "lane"
+
+
+def prepared(unit: SumoUnit, folder: Path) -> tuple[NetMap, Run]:
+    """The map of a simulation, and what SUMO is to simulate on it.
+
+    Args:
+        unit: from :func:`units`.
+        folder: where network and traffic are written.
+
+    Raises:
+        RuntimeError: SUMO failed to make the network.
+        SceneError: a file of the user's own cannot be used.
+    """
+    if unit.net:
+        return _own(unit, folder)
     preset = settings()["presets"][unit.preset]
     network = make_network(folder, preset["network"], preset["signalled"], unit.number)
-    recording = simulate_traffic(_random_run(unit, network, preset, folder), folder)
-    return build_map(network, unit.options.point_spacing), recording
+    return build_map(network, unit.options.point_spacing), _random_run(unit, network, preset, folder)
+
+
+def recorded(unit: SumoUnit, run: Run, folder: Path) -> Recording:
+    """What happens in a simulation.
+
+    Args:
+        unit: from :func:`units`.
+        run: of :func:`prepared`, or one like it.
+        folder: where SUMO writes.
+
+    Raises:
+        RuntimeError: SUMO failed on a network of its own.
+        SceneError: it failed on the user's files.
+    """
+    try:
+        return simulate_traffic(run, folder)
+    except RuntimeError as error:
+        if not unit.net:
+            raise
+        files = " with ".join(file for file in (unit.net, unit.routes) if file)
+        raise SceneError(f"{files}: SUMO cannot simulate it; correct what it says: {error}") from error
 
 
 def _random_run(unit: SumoUnit, network: Network, rules: dict[str, dict], folder: Path) -> Run:
@@ -212,22 +263,16 @@ def _random_run(unit: SumoUnit, network: Network, rules: dict[str, dict], folder
     return Run(network, folder / "demand.rou.xml", bodies, unit.number, 0.0, options.warmup, duration)
 
 
-def _own(unit: SumoUnit, folder: Path) -> tuple[NetMap, Recording]:
+def _own(unit: SumoUnit, folder: Path) -> tuple[NetMap, Run]:
     """The user's own network, with random traffic or the user's own."""
     network, road = own_network(Path(unit.net), unit.options.point_spacing)
-    if unit.routes:
-        routes, options = read_routes(Path(unit.routes)), unit.options
-        duration = options.windows * options.window_spacing
-        begin = routes.stretch(unit.number, duration)
-        extra = {"scale": options.density, "route-steps": 0}  # all routes at once, so they need no order
-        run = Run(network, routes.path, routes.bodies, unit.number, begin, options.warmup, duration, extra)
-    else:
-        run = _random_run(unit, network, settings()["own_network"], folder)
-    try:
-        return road, simulate_traffic(run, folder)
-    except RuntimeError as error:
-        files = " with ".join(file for file in (unit.net, unit.routes) if file)
-        raise SceneError(f"{files}: SUMO cannot simulate it; correct what it says: {error}") from error
+    if not unit.routes:
+        return road, _random_run(unit, network, settings()["own_network"], folder)
+    routes, options = read_routes(Path(unit.routes)), unit.options
+    duration = options.windows * options.window_spacing
+    begin = routes.stretch(unit.number, duration)
+    extra = {"scale": options.density, "route-steps": 0}  # all routes at once, so they need no order
+    return road, Run(network, routes.path, routes.bodies, unit.number, begin, options.warmup, duration, extra)
 
 
 def _turns(unit: SumoUnit, tracks: Tracks) -> Iterator[tuple[int, int]]:
@@ -281,7 +326,13 @@ def _try_files(unit: SumoUnit) -> None:
         read_routes(Path(unit.routes))
 
 
-def _read_unit(text: str) -> SumoUnit:
+def read_unit(text: str) -> SumoUnit:
+    """The simulation that :attr:`SumoUnit.text` tells.
+
+    Examples:
+        >>> read_unit(units(5, max_agents=24)[0].text).options.max_agents
+        24
+    """
     told = parse(text)
     own = {name: str(told.pop(name, "")) for name in ("preset", "net", "routes")}
     number, num_scenes = told.pop("number"), told.pop("num_scenes")
@@ -290,7 +341,7 @@ def _read_unit(text: str) -> SumoUnit:
 
 def _records(text: str) -> Iterator[Record]:
     """The scenes of one simulation, which runs once, when the first of them is made."""
-    unit = _read_unit(text)
+    unit = read_unit(text)
 
     @cache
     def outcome() -> list[Scene] | SceneError:
@@ -310,7 +361,7 @@ def _records(text: str) -> Iterator[Record]:
 
 def _size(text: str) -> int:
     """A number that changes with the user's own files, by their bytes, and with the settings of all simulations."""
-    unit = _read_unit(text)
+    unit = read_unit(text)
     return sum(file_size(path) for path in (unit.net, unit.routes) if path) + settings_digest()
 
 
@@ -319,7 +370,7 @@ SUMO = Source(
     help="scenes simulated with SUMO; instead of files: num_scenes=160,seed=0,split=train,preset=mixed (or net=FILE)",
     find=_find,
     records=_records,
-    count=lambda text: _read_unit(text).num_scenes,
+    count=lambda text: read_unit(text).num_scenes,
     size=_size,
     lacks=Lacks.HEIGHT,
 )

@@ -109,6 +109,18 @@ def write_demand(
     path.write_text("\n".join(["<routes>", *kinds, *told, "</routes>"]), encoding="utf-8")
 
 
+def targets_of(network: Network, source: str, by_lane: bool) -> list[str]:
+    """Where a trip may end, each as likely as the others.
+
+    Args:
+        network: where.
+        source: street that it begins on.
+        by_lane: a way out stands there once for each of its lanes.
+    """
+    targets = network.ways_out()[source]
+    return [t for t in targets for _ in network.edges[t].lanes_for("vehicle")] if by_lane else targets
+
+
 class _Demand:
     """Draws trips."""
 
@@ -154,9 +166,7 @@ class _Demand:
 
     def _drive(self, road_user: str, depart: float, source: NetEdge) -> _Trip:
         name = self._type(road_user)
-        targets = self.ways_out[source.edge_id]
-        if self.by_lane:
-            targets = [t for t in targets for _ in self.network.edges[t].lanes_for("vehicle")]
+        targets = targets_of(self.network, source.edge_id, self.by_lane)
         # at the start anywhere; later just inside the dead end, the tail on the map
         position = "random_free" if depart == 0 else f"{self.types[name]['length'] + 0.5:.2f}"
         way = f'from="{source.edge_id}" to="{targets[self.rng.integers(len(targets))]}" departPos="{position}"'

@@ -141,7 +141,7 @@ def sumo_binary(name: str) -> str:
     """Path of a SUMO program.
 
     Args:
-        name: ``"sumo"``, ``"netgenerate"`` or ``"netconvert"``.
+        name: ``"sumo"``, ``"duarouter"``, ``"netgenerate"`` or ``"netconvert"``.
 
     Raises:
         ImportError: SUMO is not installed; the message names the extra.

@@ -31,6 +31,7 @@ class Tracks:
     """Road users of a simulation at 10 Hz.
 
     Attributes:
+        owner: ``[V]``, place of the road user in the recording.
         kind: ``[V]``, :class:`~envs.scene.AgentKind`.
         is_car: ``[V]`` bool, can be an SDC.
         extent: ``[V, 3]`` [m].
@@ -41,6 +42,7 @@ class Tracks:
         valid: ``[V, T]`` bool; one unbroken run for each road user.
     """
 
+    owner: np.ndarray
     kind: np.ndarray
     is_car: np.ndarray
     extent: np.ndarray
@@ -71,6 +73,7 @@ def make_tracks(recording: Recording) -> Tracks:
     share = np.array([AXLE_SHARE[AgentKind(kind)] for kind in recording.kind])
     trailed = trail(centre, heading[owner], (share * recording.extent[:, 0])[owner])
     return Tracks(
+        owner=owner,
         kind=recording.kind[owner],
         is_car=recording.is_car[owner],
         extent=recording.extent[owner],

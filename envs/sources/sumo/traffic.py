@@ -18,6 +18,7 @@ class Recording:
     """What a simulation wrote down, at 10 Hz.
 
     Attributes:
+        names: SUMO's id of each road user.
         kind: ``[V]``, :class:`~envs.scene.AgentKind`.
         is_car: ``[V]`` bool, vehicles that can be an SDC.
         extent: ``[V, 3]``, length, width, height [m].
@@ -27,6 +28,7 @@ class Recording:
         lights: the letters of each traffic light at every step, ``{id: [state, ...]}``.
     """
 
+    names: list[str]
     kind: np.ndarray
     is_car: np.ndarray
     extent: np.ndarray
@@ -77,13 +79,14 @@ def simulate_traffic(run: Run, folder: Path) -> Recording:
     (folder / "events.add.xml").write_text("\n".join(["<additional>", *events, "</additional>"]), encoding="utf-8")
     _simulate(run, folder)
     first, steps = (round(time / STEP_SECONDS) for time in (run.begin + run.warmup, run.duration))
-    types, values = _read_tracks(folder / "tracks.csv", first, steps)
+    names, types, values = _read_tracks(folder / "tracks.csv", first, steps)
     unknown = sorted(set(types) - set(run.bodies))
     if unknown:
         raise SceneError(f"{run.routes}: somebody is of type {unknown[0]!r}; write its <vType> into this file.")
     recorded = [i for i, name in enumerate(types) if run.bodies[name] is not None]
     bodies, values = [run.bodies[types[i]] for i in recorded], values[recorded]
     return Recording(
+        names=[names[i] for i in recorded],
         kind=np.array([int(body.kind) for body in bodies], dtype=np.int64),
         is_car=np.array([body.is_car for body in bodies], dtype=bool),
         extent=np.array([body.extent for body in bodies], dtype=np.float64).reshape(-1, 3),
@@ -136,14 +139,14 @@ def _read_lights(path: Path, first: int, steps: int) -> dict[str, list[str]]:
     return states
 
 
-def _read_tracks(path: Path, first: int, steps: int) -> tuple[list[str], np.ndarray]:
-    """Types of those who were seen ``[V]``, and their x, y, angle and speed ``[V, T, 4]`` (NaN where absent)."""
+def _read_tracks(path: Path, first: int, steps: int) -> tuple[list[str], list[str], np.ndarray]:
+    """Ids and types of those who were seen ``[V]``, and x, y, angle and speed ``[V, T, 4]`` (NaN where absent)."""
     with path.open(encoding="utf-8") as file:
         # SUMO names the columns after whoever is seen first: vehicle_id or person_id
         names = [name.split("_")[-1] for name in file.readline().strip().split(";")]
         rows = [line.rstrip("\n").split(";") for line in file]
     if not rows:
-        return [], np.zeros((0, steps, 4))
+        return [], [], np.zeros((0, steps, 4))
     column = dict(zip(names, zip(*rows, strict=True), strict=True))
     seen = np.array(column["id"], dtype=object) != ""  # a step when nobody is there is a row of its own
     step = np.rint(np.array(column["time"], dtype=np.float64) / STEP_SECONDS).astype(np.int64) - first
@@ -154,4 +157,4 @@ def _read_tracks(path: Path, first: int, steps: int) -> tuple[list[str], np.ndar
     values = np.full((len(order), steps, 4), np.nan)
     cells = np.array([[column[name][i] for name in ("x", "y", "angle", "speed")] for i in kept], dtype=np.float64)
     values[[order[name] for name in ids], step[kept]] = cells.reshape(-1, 4)
-    return [type_of[name] for name in order], values
+    return list(order), [type_of[name] for name in order], values
