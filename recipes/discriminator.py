@@ -28,7 +28,7 @@ from envs.episode import EpisodeOptions
 from envs.files import write_json
 from envs.store import SceneStore
 from recipes.common.cli import CONFIG, build, finished, finite, plain, recipe
-from recipes.common.models import open_policy, policies_of, weights_digest
+from recipes.common.models import given_policies, open_policy, weights_digest
 from recipes.common.rankings import build_distance
 from recipes.common.rolled import Rolled
 from recipes.common.scenes import fingerprint, open_splits
@@ -38,7 +38,6 @@ from recipes.studies.spurious import QUANTITIES, RANKINGS, summarise
 from recipes.studies.study import (
     RANDOM_GROUPS,
     as_json,
-    check_readable,
     how_made,
     random_groups,
     rolled_out,
@@ -202,8 +201,7 @@ def main(cfg: DictConfig) -> None:
     check(cfg)
     metric = RealismConfig.load(str(cfg.metric))
     sight, distance = build(Sight, cfg.sight, "sight"), build_distance(cfg.ranking, "ranking")
-    policies, splits = policies_of(cfg), open_splits(cfg.scenes)
-    check_readable(policies)
+    policies, splits = given_policies(cfg), open_splits(cfg.scenes)
     scenes, measured, training = splits[cfg.split], {}, {}
     for name, path in policies.items():
         net, training[name] = trained(cfg, splits.train, path, name)

@@ -23,7 +23,7 @@ from envs.episode import EpisodeOptions
 from envs.files import write_json
 from envs.scene import AgentKind, Scene, SceneSource
 from recipes.common.cli import CONFIG, plain, recipe
-from recipes.common.models import open_policy, policies_of, weights_digest
+from recipes.common.models import given_policies, open_policy, policies_of, weights_digest
 from recipes.common.rolled import Rolls, driven, logs
 from recipes.common.scenes import fingerprint, open_splits
 from recipes.studies.rows import looked_at, read_or_score
@@ -121,9 +121,10 @@ def tables(found: dict[str, Figures], names: Sequence[str]) -> Iterator[StudyTab
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.encounters``."""
+    policies = given_policies(cfg)
     scenes = open_splits(cfg.scenes)[cfg.split]
     found = measure_encounters(cfg, scenes)
-    tell(cfg, list(tables(found, list(policies_of(cfg)))), {})
+    tell(cfg, list(tables(found, list(policies))), {})
     if cfg.json is not None:
         write_json(cfg.json, {"scenes": len(scenes), "rows": found})
 

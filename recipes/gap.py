@@ -37,7 +37,7 @@ from envs.options import differences
 from envs.scene import STEP_SECONDS, Scene, SceneSource, select_agents
 from envs.seeding import make_generator
 from recipes.common.cli import CONFIG, build, plain, recipe
-from recipes.common.models import open_policy, policies_of, weights_digest
+from recipes.common.models import given_policies, open_policy, policies_of, weights_digest
 from recipes.common.rolled import Rolls, driven, logs
 from recipes.common.scenes import fingerprint, open_splits
 from recipes.studies.rows import looked_at, read_or_score
@@ -201,9 +201,10 @@ def tables(gap: dict[str, dict[str, list[float | None]]], names: Sequence[str], 
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.gap``."""
+    policies = given_policies(cfg)
     scenes = open_splits(cfg.scenes)[cfg.split]
     gap = measure_gap(cfg, scenes)
-    tell(cfg, tables(gap, list(policies_of(cfg)), len(scenes)), {})
+    tell(cfg, tables(gap, list(policies), len(scenes)), {})
     if cfg.json is not None:
         write_json(cfg.json, {"scenes": len(scenes), "rows": gap})
 

@@ -30,7 +30,15 @@ from envs.seeding import make_generator
 from envs.sources.sumo.futures import Keeps
 from envs.store import SceneStore
 from recipes.common.cli import CONFIG, finite, mean_known, plain, recipe
-from recipes.common.models import episode_options, fresh_policy, open_policy, policies_of, policy_config, weights_digest
+from recipes.common.models import (
+    episode_options,
+    fresh_policy,
+    given_policies,
+    open_policy,
+    policies_of,
+    policy_config,
+    weights_digest,
+)
 from recipes.common.rolled import Rolls, driven
 from recipes.common.scenes import fingerprint, open_splits
 from recipes.studies.rows import looked_at, read_or_score
@@ -169,6 +177,8 @@ def table(ladder: dict[str, dict], years: list[str]) -> StudyTable:
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.ladder``."""
+    if cfg.policies:
+        given_policies(cfg)
     scenes = open_splits(cfg.scenes)[cfg.split]
     ladder, years = climb(cfg, scenes), years_of(cfg)
     tell(cfg, [table(ladder, years)], {})

@@ -31,7 +31,7 @@ from envs import keys
 from envs.render import check_writable
 from envs.store import SceneStore
 from recipes.common.cli import CONFIG, build, recipe
-from recipes.common.models import open_policy, policies_of
+from recipes.common.models import given_policies, open_policy
 from recipes.common.rankings import build_distance
 from recipes.common.rolled import rolled
 from recipes.common.scenes import open_splits
@@ -146,7 +146,7 @@ def main(cfg: DictConfig) -> None:
         known = ", ".join((".html", *DRAWN))
         raise ValueError(f"output={cfg.output} is no page, picture or film; name a file that ends in one of {known}.")
     check_writable(cfg.output)
-    policies = policies_of(cfg)
+    policies = given_policies(cfg)
     scenes = open_splits(cfg.scenes)[cfg.split]
     players = roll_out(
         policies,

@@ -25,7 +25,7 @@ from dpa.report.studies import plot_references
 from dpa.training.loggers import read_curve
 from dpa.training.run import seconds_trained
 from recipes.common.cli import CONFIG, build, recipe
-from recipes.common.models import num_parameters, open_policy, policies_of
+from recipes.common.models import given_policies, num_parameters, open_policy
 from recipes.common.scenes import open_splits
 from recipes.evaluate import evaluate
 from recipes.studies.tables import Cell, StudyTable, tell
@@ -98,8 +98,9 @@ def measured(training: Training, result: dict[str, Any], parameters: int) -> lis
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.references``."""
-    scenes, policies = open_splits(cfg.scenes)[cfg.split], policies_of(cfg)
+    policies = given_policies(cfg)
     trainings = {name: Training.of(path) for name, path in policies.items()}
+    scenes = open_splits(cfg.scenes)[cfg.split]
     rows, output, decoding = {}, Path(cfg.output), build(Decoding, cfg.decoding, "decoding")
     for name, path in policies.items():
         result = evaluate(cfg, scenes, path, decoding, cfg.seed, output / f"{name.replace('/', '_')}.json")

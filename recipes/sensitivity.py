@@ -26,6 +26,7 @@ from dpa.report.statistics import Interval, summary
 from dpa.report.studies import plot_sensitivity
 from envs.files import write_json
 from recipes.common.cli import CONFIG, recipe
+from recipes.common.models import given_policies
 from recipes.common.rolled import Rolled
 from recipes.common.scenes import open_splits
 from recipes.studies.study import ADE, as_json, distances_of, how_made, over_scenes, study
@@ -188,6 +189,7 @@ def main(cfg: DictConfig) -> None:
     distances = distances_of(cfg.rankings, "rankings")
     if cfg.baseline not in distances:
         raise ValueError(f"baseline must be one of the rankings {', '.join(distances)}, got {cfg.baseline!r}.")
+    given_policies(cfg)
     scenes = open_splits(cfg.scenes)[cfg.split]
     decided_by = {"rankings": {name: distance.describe() for name, distance in distances.items()}}
     measured = study(cfg, scenes, lambda each: measure_scene(each, distances), decided_by)

@@ -24,6 +24,7 @@ from dpa.report.statistics import Interval, paired_bootstrap, summary
 from dpa.report.studies import plot_validity
 from envs.files import write_json
 from recipes.common.cli import CONFIG, finite, recipe
+from recipes.common.models import given_policies
 from recipes.common.rolled import Rolled
 from recipes.common.scenes import open_splits
 from recipes.studies.study import (
@@ -173,6 +174,7 @@ def main(cfg: DictConfig) -> None:
     if cfg.against not in (*distances, ADE):
         raise ValueError(f"against must be one of {', '.join((*distances, ADE))}, got {cfg.against!r}.")
     metric = RealismConfig.load(str(cfg.metric))
+    given_policies(cfg)
     scenes = open_splits(cfg.scenes)[cfg.split]
     decided_by = {
         "window": cfg.window,

@@ -234,6 +234,22 @@ def policies_of(cfg: DictConfig) -> dict[str, Path]:
     return dict(zip(names if len({*names}) == len(names) else paths, map(Path, paths), strict=True))
 
 
+def given_policies(cfg: DictConfig) -> dict[str, Path]:
+    """The policies of :func:`policies_of`, which are whole: asked before scenes are converted for them.
+
+    So a slip in the last path is told before the hours of the first.
+
+    Raises:
+        FileNotFoundError: no such file.
+        CheckpointError: a file is damaged or no policy.
+        ValueError: no policy is named, or nothing is like a wildcard.
+    """
+    policies = policies_of(cfg)
+    for path in policies.values():
+        load_policy(path)
+    return policies
+
+
 def _like(path: str) -> list[str]:
     """The file itself, or those that are like it where its name has wildcards."""
     if path.startswith(zoo.PREFIX):

@@ -15,7 +15,6 @@ from dpa.models import Decoding, MotionModel
 from dpa.ranking import Distance
 from dpa.report.statistics import Interval, summary
 from dpa.rollout import make_collector
-from dpa.training.checkpoint import load_policy
 from envs.episode import EpisodeOptions
 from envs.files import write_json
 from envs.progress import progress
@@ -54,15 +53,8 @@ def study(cfg: DictConfig, scenes: SceneStore, measure: Measure, decided_by: dic
     Raises:
         ValueError: no policy is given.
     """
-    policies = policies_of(cfg)
-    check_readable(policies)
-    return {name: study_policy(cfg, scenes, path, measure, decided_by, name) for name, path in policies.items()}
-
-
-def check_readable(policies: Mapping[str, Path]) -> None:
-    """Read every policy once, so that a slip in the last path is told before the hours of the first."""
-    for path in policies.values():
-        load_policy(path)
+    policies = policies_of(cfg).items()
+    return {name: study_policy(cfg, scenes, path, measure, decided_by, name) for name, path in policies}
 
 
 def study_policy(

@@ -39,6 +39,8 @@ RECIPES = (
     "compare", "validity", "sensitivity",
 )  # fmt: skip
 NANO = "zoo:motionlm-nano-sumo"
+SEVERAL = ("gap", "encounters", "ladder", "references", "validity", "sensitivity", "discriminator")
+"""Recipes that are given several policies."""
 WITHOUT_POLICY = tuple(recipe for recipe in RECIPES if recipe not in ("collect", "align", "evaluate"))
 pytestmark = pytest.mark.usefixtures("stores")
 
@@ -436,6 +438,7 @@ def test_options_of_ones_own_classes_are_judged_by_their_annotations_alone(monke
         ("collect", "policy=none.pt", "none.pt does not exist"),
         ("align", "policy=none.pt", "none.pt does not exist"),
         ("rerank", "policy=none.pt", "none.pt does not exist"),
+        *((recipe, f"policies=[{NANO},none.pt]", "none.pt does not exist") for recipe in SEVERAL),
     ],
 )
 def test_what_is_not_there_is_told_before_any_scene_is_converted(
