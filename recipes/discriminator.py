@@ -15,7 +15,7 @@ from typing import Any
 
 import hydra
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from dpa.discriminator import Discriminator, mean_squared_jerk, until_first_hole
@@ -26,11 +26,12 @@ from dpa.tokens import MotionTokenizer
 from dpa.training.checkpoint import load_policy, load_weights, save_policy
 from envs.episode import EpisodeOptions
 from envs.files import write_json
+from envs.progress import progress
 from envs.store import SceneStore
 from recipes.common.cli import CONFIG, build, finished, finite, plain, recipe
 from recipes.common.models import given_policies, open_policy, weights_digest
 from recipes.common.rankings import build_distance
-from recipes.common.rolled import Rolled
+from recipes.common.rolled import Rolled, driven
 from recipes.common.scenes import fingerprint, open_splits
 from recipes.studies.adversary import best_look, fit
 from recipes.studies.motions import MotionShelf, Sight, driven_log
@@ -40,7 +41,6 @@ from recipes.studies.study import (
     as_json,
     how_made,
     random_groups,
-    rolled_out,
     study_policy,
 )
 from recipes.studies.tables import StudyTable, tell
@@ -83,8 +83,11 @@ def trained(cfg: DictConfig, scenes: SceneStore, policy: Path, name: str) -> tup
     shelf = MotionShelf(folder / "motions", rolled_by | {"num_rollouts": cfg.training.num_rollouts})
     there = frozenset(shelf.scenes())
     see = partial(seen, sight=sight, tokenizer=model.tokenizer.on_cpu(), options=episode)
-    for each in rolled_out(cfg, scenes, model, episode, cfg.training.num_rollouts, there, f"{name} rollouts"):
-        shelf.put(each.index, see(each)[0])
+    rolling = OmegaConf.merge(cfg, {"num_rollouts": cfg.training.num_rollouts})
+    with progress(total=len(scenes), description=f"{name} rollouts", initial=len(there), unit="scene") as bar:
+        for each in driven(scenes, model, episode, rolling, there):
+            shelf.put(each.index, see(each)[0])
+            bar.update()
     net, curve = fit(cfg.training, shape, shelf, folder, seed=cfg.seed, decided_by=decided_by, logger=cfg.logger)
     save_policy(weights, net.state_dict(), shape, {"seed": cfg.seed})
     done = {"options": decided_by, "scenes": len(scenes), "best": best_look(curve), "curve": curve}

@@ -3,14 +3,14 @@
 python -m recipes.encounters 'policies=[zoo:motionlm-nano-sumo,zoo:smart-nano-sumo]'
 
 With somebody beside them, ahead or behind, headed across or oncoming: what a collision rate sums up. Of several
-policies each is also told minus the first, scene by scene. Run the same command again to go on after a kill: policies
-that are there are read back.
+policies each is also told minus the first, scene by scene. Run the same command again to go on after a kill, with the
+next scene.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -21,12 +21,13 @@ from torch import Tensor
 from dpa.realism import Encounter, RealismConfig, compare, encounters, measure
 from envs.episode import EpisodeOptions
 from envs.files import write_json
-from envs.scene import AgentKind, Scene, SceneSource
+from envs.scene import AgentKind, Scene
+from envs.store import SceneStore
 from recipes.common.cli import CONFIG, plain, recipe
 from recipes.common.models import given_policies, open_policy, policies_of, weights_digest
-from recipes.common.rolled import Rolls, driven, logs
-from recipes.common.scenes import fingerprint, open_splits
-from recipes.studies.rows import looked_at, read_or_score
+from recipes.common.rolled import driven, logs
+from recipes.common.scenes import open_splits
+from recipes.studies.rows import Roll, measure_row
 from recipes.studies.tables import StudyTable, minus, over_scenes, tell
 
 CLASSES = {AgentKind.VEHICLE: "vehicles", AgentKind.PEDESTRIAN: "pedestrians", AgentKind.CYCLIST: "cyclists"}
@@ -63,33 +64,32 @@ def look(scene: Scene, trajectories: Tensor, metric: RealismConfig) -> dict[str,
     return found
 
 
-def score(scenes: SceneSource, roll: Callable[[SceneSource], Rolls], metric: RealismConfig, name: str) -> Figures:
-    """Each figure of :func:`look` as one value per scene."""
-    ordered = looked_at(scenes, roll(scenes), partial(look, metric=metric), name)
-    return {kind: {how: [each[kind][how] for each in ordered] for how in (ALL, *MET.values())} for kind in ordered[0]}
-
-
-def rows(cfg: DictConfig) -> Iterator[tuple[str, dict[str, Any], Callable[[SceneSource], Rolls]]]:
+def rows(cfg: DictConfig, scenes: SceneStore) -> Iterator[tuple[str, dict[str, Any], Roll]]:
     """Name of each row, what decides it, and its rollouts: the log, then the policies."""
-    yield "log", {}, lambda scenes: logs(scenes, EpisodeOptions(), None)
+    yield "log", {}, partial(logs, scenes, EpisodeOptions(), None)
     for name, path in policies_of(cfg).items():
         model, options, config = open_policy(path, cfg.device)
         told = {"policy": weights_digest(model), **config, "decoding": plain(cfg.decoding), "seed": cfg.seed}
-        yield name, told | {"num_rollouts": cfg.num_rollouts}, partial(driven, model=model, options=options, cfg=cfg)
+        yield name, told | {"num_rollouts": cfg.num_rollouts}, partial(driven, scenes, model, options, cfg)
 
 
-def measure_encounters(cfg: DictConfig, scenes: SceneSource) -> dict[str, Figures]:
-    """Score every row, or read it back.
+def measure_encounters(cfg: DictConfig, scenes: SceneStore) -> dict[str, Figures]:
+    """Measure every row, or read it back.
 
     Raises:
-        ValueError: a row was scored with other options.
+        ValueError: a row was measured with other options.
     """
-    metric = RealismConfig.load(str(cfg.metric))
-    common = {"scenes": fingerprint(scenes), "metric": metric.describe()}
-    return {
-        name: read_or_score(cfg.output, name, common | own, "figures", partial(score, scenes, roll, metric, name))
-        for name, own, roll in rows(cfg)
-    }
+    metric, found = RealismConfig.load(str(cfg.metric)), {}
+    common = {"metric": metric.describe()}
+    for name, own, roll in rows(cfg, scenes):
+        measured = measure_row(
+            cfg.output, name, common | own, scenes, roll, lambda each: look(each.scene, each.trajectories, metric)
+        )
+        found[name] = {
+            kind: {how: [each[kind][how] for each in measured] for how in (ALL, *MET.values())}
+            for kind in CLASSES.values()
+        }
+    return found
 
 
 def tables(found: dict[str, Figures], names: Sequence[str]) -> Iterator[StudyTable]:

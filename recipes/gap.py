@@ -9,18 +9,17 @@ one thing: replayed agents show the policy where they are, and no tokens, which 
 agents whose log goes on to the end are looked at, so that nobody runs into one that is no longer there.
 
 Of several policies each is also told minus the first, scene by scene. Run the same command again to go on after a
-kill: rows that are there are read back.
+kill, with the next scene.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import hydra
-import numpy as np
 import torch
 from omegaconf import DictConfig
 from torch import Tensor
@@ -36,11 +35,12 @@ from envs.geometry.frames import to_world
 from envs.options import differences
 from envs.scene import STEP_SECONDS, Scene, SceneSource, select_agents
 from envs.seeding import make_generator
+from envs.store import SceneStore
 from recipes.common.cli import CONFIG, build, plain, recipe
 from recipes.common.models import given_policies, open_policy, policies_of, weights_digest
-from recipes.common.rolled import Rolls, driven, logs
-from recipes.common.scenes import fingerprint, open_splits
-from recipes.studies.rows import looked_at, read_or_score
+from recipes.common.rolled import Rolled, driven, logs, waiting
+from recipes.common.scenes import open_splits
+from recipes.studies.rows import Roll, measure_row
 from recipes.studies.tables import StudyTable, minus, over_scenes, tell
 
 PLACES = ("single decisions", "alone", "among its own")
@@ -50,12 +50,16 @@ SECONDS = (2.0, 8.0)
 
 
 def single_decisions(
-    scenes: SceneSource, model: MotionModel, options: EpisodeOptions, decoding: Decoding, cfg: DictConfig
-) -> Rolls:
+    scenes: SceneSource,
+    model: MotionModel,
+    options: EpisodeOptions,
+    decoding: Decoding,
+    cfg: DictConfig,
+    done: Collection[int] = (),
+) -> Iterator[Rolled]:
     """Every decision of the self-driving car taken from where the log, through its tokens, has brought it."""
     options, tokenizer = replace(options, control="sdc"), model.tokenizer.on_cpu()
-    for index in range(len(scenes)):
-        scene = scenes[index]
+    for index, scene in waiting(scenes, done):
         context = make_context(scene, model.featurize, options)
         episode = context.episode
         tracks = tokenizer.encode_tracks(episode.logged, episode.logged_valid, episode.recent, episode.kind)
@@ -70,10 +74,12 @@ def single_decisions(
         before = before.movedim(-1, -2)[:, : shape[2]].expand(*shape, -1, -1)
         kind = episode.kind[:, None].expand(shape)
         moved = to_world(tokenizer.decode(tokens, before, kind), before[..., -1:, :]).flatten(2, 3)
-        yield index, lifted(scene, torch.where(episode.controlled[:, None, None], moved, episode.logged))
+        yield Rolled.of(
+            index, scene, lifted(scene, torch.where(episode.controlled[:, None, None], moved, episode.logged))
+        )
 
 
-def rows(cfg: DictConfig) -> Iterator[tuple[str, dict[str, Any], Callable[[SceneSource], Rolls]]]:
+def rows(cfg: DictConfig, scenes: SceneStore) -> Iterator[tuple[str, dict[str, Any], Roll]]:
     """Name of each row, what decides it, and its rollouts.
 
     Raises:
@@ -85,22 +91,21 @@ def rows(cfg: DictConfig) -> Iterator[tuple[str, dict[str, Any], Callable[[Scene
     for name, (_, _, config) in policies.items():
         if differ := differences(config["tokenizer"], first["tokenizer"]):
             raise ValueError(f"{name} has other tokens than the first policy ({differ}); ask for it alone.")
-    cut, tokenizer, several = options, model.tokenizer.on_cpu(), len(policies) > 1
-    yield "log", {}, lambda scenes: logs(scenes, cut, None)
-    yield "log through tokens", {"tokenizer": first["tokenizer"]}, lambda scenes: logs(scenes, cut, tokenizer)
+    tokenizer, several = model.tokenizer.on_cpu(), len(policies) > 1
+    yield "log", {}, partial(logs, scenes, options, None)
+    yield "log through tokens", {"tokenizer": first["tokenizer"]}, partial(logs, scenes, options, tokenizer)
     for name, (model, options, config) in policies.items():
         own = told | {"policy": weights_digest(model), **config}
-        alone, among = replace(options, control="sdc"), replace(options, control="all")
         rolls = (
-            lambda s, m=model, o=options: single_decisions(s, m, o, decoding, cfg),
-            lambda s, m=model, o=alone: driven(s, m, o, cfg),
-            lambda s, m=model, o=among: driven(s, m, o, cfg),
+            partial(single_decisions, scenes, model, options, decoding, cfg),
+            partial(driven, scenes, model, replace(options, control="sdc"), cfg),
+            partial(driven, scenes, model, replace(options, control="all"), cfg),
         )
         for row, roll in zip(PLACES, rolls, strict=True):
             yield f"{name}: {row}" if several else row, own, roll
 
 
-def look(scene: Scene, trajectories: Tensor, metric: RealismConfig) -> dict[str, float]:
+def look(scene: Scene, trajectories: Tensor, metric: RealismConfig) -> dict[str, float | None]:
     """What becomes of the self-driving car by each of :data:`SECONDS`; shares and means over rollouts.
 
     Args:
@@ -109,7 +114,7 @@ def look(scene: Scene, trajectories: Tensor, metric: RealismConfig) -> dict[str,
         metric: whose measurements these are.
 
     Returns:
-        ``collision``, ``off-road`` and ``away`` (from the log [m]), each by some seconds; NaN where its log has ended.
+        ``collision``, ``off-road`` and ``away`` (from the log [m]), each by some seconds; None where its log has ended.
 
     Raises:
         ValueError: the scene has no self-driving car.
@@ -129,7 +134,7 @@ def look(scene: Scene, trajectories: Tensor, metric: RealismConfig) -> dict[str,
     }
     found = happened | {"away [m]": away}
     return {
-        f"{name} {seconds:g} s": found[name][_last(seconds)].item() if there[_last(seconds)] else float("nan")
+        f"{name} {seconds:g} s": found[name][_last(seconds)].item() if there[_last(seconds)] else None
         for name in found
         for seconds in SECONDS
     }
@@ -146,31 +151,19 @@ def _last(seconds: float) -> int:
     return round(seconds / STEP_SECONDS) - 1
 
 
-def score(
-    scenes: SceneSource, roll: Callable[[SceneSource], Rolls], metric: RealismConfig, name: str
-) -> dict[str, list[float | None]]:
-    """Each figure of :func:`look` as one value per scene; None where the log has left by then."""
-    ordered = looked_at(scenes, roll(scenes), partial(look, metric=metric), name)
-    return {key: [None if np.isnan(each[key]) else each[key] for each in ordered] for key in ordered[0]}
-
-
-def measure_gap(cfg: DictConfig, scenes: SceneSource) -> dict[str, dict[str, list[float | None]]]:
-    """Score every row, or read it back; ``{row: {figure: one value per scene}}``.
+def measure_gap(cfg: DictConfig, scenes: SceneStore) -> dict[str, dict[str, list[float | None]]]:
+    """Measure every row, or read it back; ``{row: {figure: one value per scene}}``.
 
     Raises:
-        ValueError: a row was scored with other options.
+        ValueError: a row was measured with other options.
     """
-    metric = RealismConfig.load(str(cfg.metric))
-    common = {
-        "scenes": fingerprint(scenes),
-        "num_rollouts": cfg.num_rollouts,
-        "seed": cfg.seed,
-        "metric": metric.describe(),
-    }
-    gap = {}
-    for name, own, roll in rows(cfg):
-        figures = partial(score, scenes, roll, metric, name)
-        gap[name] = read_or_score(cfg.output, name, common | own, "figures", figures)
+    metric, gap = RealismConfig.load(str(cfg.metric)), {}
+    common = {"num_rollouts": cfg.num_rollouts, "seed": cfg.seed, "metric": metric.describe()}
+    for name, own, roll in rows(cfg, scenes):
+        measured = measure_row(
+            cfg.output, name, common | own, scenes, roll, lambda each: look(each.scene, each.trajectories, metric)
+        )
+        gap[name] = {figure: [each[figure] for each in measured] for figure in measured[0]}
     return gap
 
 

@@ -2,10 +2,9 @@
 
 python -m recipes.ladder scenes=gpudrive scenes.train=DIR scenes.eval=DIR policies=[runs/pretrain/policy.pt]
 
-A metric that is worth trusting puts the rungs in their order. Run the same command again to go on after a kill: rungs
-that are there are read back. Of scenes from SUMO, ``simulator=true`` adds what SUMO itself does when it goes on from
-the current step: what the logs were drawn from, by one who knows all drivers, and everybody's way or only what can be
-seen of it.
+A metric that is worth trusting puts the rungs in their order. Run the same command again to go on after a kill,
+with the next scene. Of scenes from SUMO, ``simulator=true`` adds what SUMO itself does when it goes on from the current
+step: what the logs were drawn from, by one who knows all drivers, and everybody's way or only what can be seen of it.
 """
 
 from __future__ import annotations
@@ -18,15 +17,12 @@ from typing import Any
 import hydra
 import numpy as np
 from omegaconf import DictConfig
-from torch import Tensor
 
 from dpa.ranking import agent_spread
 from dpa.realism import CLASS_RATES, RealismConfig, class_rates, realism
 from dpa.report.statistics import summary
 from dpa.training.seeding import seed_everything
 from envs.files import write_json
-from envs.scene import Scene, SceneSource
-from envs.seeding import make_generator
 from envs.sources.sumo.futures import Keeps
 from envs.store import SceneStore
 from recipes.common.cli import CONFIG, finite, mean_known, plain, recipe
@@ -39,13 +35,13 @@ from recipes.common.models import (
     policy_config,
     weights_digest,
 )
-from recipes.common.rolled import Rolls, driven
-from recipes.common.scenes import fingerprint, open_splits
-from recipes.studies.rows import looked_at, read_or_score
+from recipes.common.rolled import Rolled, driven
+from recipes.common.scenes import open_splits
+from recipes.studies.rows import Roll, measure_row
 from recipes.studies.rungs import (
-    Rung,
     Simulator,
     constant_velocity,
+    crude,
     logged,
     noisy_log,
     random_tokens,
@@ -71,29 +67,19 @@ FIGURES = ("realism", "kinematic", "interactive", "map_based", *BESIDES)
 """What is kept of every scene."""
 
 
-def score_rung(scenes: SceneSource, rollouts: Rolls, metrics: Mapping[str, RealismConfig], name: str) -> dict:
-    """``{year: {figure: one value per scene}}`` of one rung; None where a scene has none."""
-
-    def figures(scene: Scene, poses: Tensor) -> dict[str, dict[str, float]]:
-        return {year: _figures(scene, poses, metric) for year, metric in metrics.items()}
-
-    found = looked_at(scenes, rollouts, figures, name)
-    return {year: {key: [finite(each[year][key]) for each in found] for key in FIGURES} for year in metrics}
-
-
-def _figures(scene: Scene, poses: Tensor, metric: RealismConfig) -> dict[str, float]:
-    result = realism(scene, poses, metric, features=True)
-    spread = agent_spread(poses[:, scene.agents.evaluated[scene.agents.present]]).mean().item()
-    return result.as_dict() | class_rates(result.features, metric) | {"spread": spread}
+def measure_scene(each: Rolled, metrics: Mapping[str, RealismConfig]) -> dict[str, dict[str, float | None]]:
+    """``{year: {figure: value}}``; None where a scene has none."""
+    agents = each.scene.agents
+    spread = agent_spread(each.trajectories[:, agents.evaluated[agents.present]]).mean().item()
+    found = {}
+    for year, metric in metrics.items():
+        result = realism(each.scene, each.trajectories, metric, features=True)
+        figures = result.as_dict() | class_rates(result.features, metric) | {"spread": spread}
+        found[year] = {name: finite(figures[name]) for name in FIGURES}
+    return found
 
 
-def crude(scenes: SceneSource, rung: Rung, num_rollouts: int, seed: int) -> Rolls:
-    """Rollouts of every scene by a rung that needs no model."""
-    for index in range(len(scenes)):
-        yield index, rung(scenes[index], num_rollouts, make_generator(seed, "ladder", index))
-
-
-def rungs(cfg: DictConfig, scenes: SceneStore) -> Iterator[tuple[str, dict[str, Any], Rolls]]:
+def rungs(cfg: DictConfig, scenes: SceneStore) -> Iterator[tuple[str, dict[str, Any], Roll]]:
     """Name, what decides it, and rollouts of each rung, from the best to expect to the worst."""
     count, seed = cfg.num_rollouts, cfg.seed
     sumo = Simulator(scenes, count, seed) if cfg.simulator else None
@@ -113,35 +99,34 @@ def rungs(cfg: DictConfig, scenes: SceneStore) -> Iterator[tuple[str, dict[str, 
     if untrained.tokenizer.vocab_size:
         made["random tokens"] = random_tokens(untrained.tokenizer)
     for name, rung in made.items():
-        yield name, {"tokenizer": config["tokenizer"]}, crude(scenes, rung, count, seed)
+        yield name, {"tokenizer": config["tokenizer"]}, partial(crude, scenes, rung, count, seed)
     for name, keeps in SIMULATOR.items() if sumo is not None else ():
-        yield name, {}, sumo.goes_on(keeps)
+        yield name, {}, partial(sumo.goes_on, keeps, None)
         told = {"tokenizer": config["tokenizer"]}
-        yield f"{name}, through tokens", told, sumo.goes_on(keeps, untrained.tokenizer)
+        yield f"{name}, through tokens", told, partial(sumo.goes_on, keeps, untrained.tokenizer)
     for name, (model, episode, config) in models.items():
-        yield name, decoding | {"policy": weights_digest(model), **config}, driven(scenes, model, episode, cfg)
+        yield name, decoding | {"policy": weights_digest(model), **config}, partial(driven, scenes, model, episode, cfg)
 
 
 def climb(cfg: DictConfig, scenes: SceneStore) -> dict[str, dict]:
-    """Score every rung, or read it back; ``{rung: {year: {figure: one value per scene}}}``.
+    """Measure every rung, or read it back; ``{rung: {year: {figure: one value per scene}}}``.
 
     Raises:
-        ValueError: no metric is named, or a rung was scored with other options.
+        ValueError: no metric is named, or a rung was measured with other options.
     """
     if not cfg.years:
         raise ValueError('years is empty: there is no metric to score by; say years=["2024"].')
     metrics = {year: RealismConfig.load(year) for year in years_of(cfg)}
     common = {
-        "scenes": fingerprint(scenes),
         "num_rollouts": cfg.num_rollouts,
         "seed": cfg.seed,
         "years": {year: metric.describe() for year, metric in metrics.items()},
         "figures": list(FIGURES),
     }
     ladder = {}
-    for name, own, rollouts in rungs(cfg, scenes):
-        score = partial(score_rung, scenes, rollouts, metrics, name)
-        ladder[name] = read_or_score(cfg.output, name, common | own, "scores", score)
+    for name, own, roll in rungs(cfg, scenes):
+        measured = measure_row(cfg.output, name, common | own, scenes, roll, partial(measure_scene, metrics=metrics))
+        ladder[name] = {year: {key: [each[year][key] for each in measured] for key in FIGURES} for year in metrics}
     return ladder
 
 

@@ -20,9 +20,6 @@ from envs.episode import EpisodeOptions, make_episode
 from envs.scene import Scene, SceneSource
 from recipes.common.cli import build
 
-Rolls = Iterator[tuple[int, Tensor]]
-"""Index of a scene and its trajectories ``[R, A, 80, 4]``."""
-
 
 class Rolled(NamedTuple):
     """The rollouts of one scene.
@@ -38,6 +35,11 @@ class Rolled(NamedTuple):
     scene: Scene
     trajectories: Tensor
     controlled: Tensor
+
+    @classmethod
+    def of(cls, index: int, scene: Scene, trajectories: Tensor) -> Rolled:
+        """All agents are controlled."""
+        return cls(index, scene, trajectories, torch.ones(trajectories.shape[1], dtype=torch.bool))
 
 
 def rolled(
@@ -62,38 +64,55 @@ def rolled(
             yield Rolled(index, scene, trajectories, controlled[row, : trajectories.shape[1]])
 
 
-def logs(scenes: SceneSource, options: EpisodeOptions, tokenizer: MotionTokenizer | None) -> Rolls:
-    """The log of every scene; where a tokenizer is given, that of the self-driving car as its tokens have it."""
-    for index in range(len(scenes)):
-        scene = scenes[index]
+def waiting(scenes: SceneSource, done: Collection[int]) -> Iterator[tuple[int, Scene]]:
+    """The scenes that are not done, with their indices."""
+    return ((index, scenes[index]) for index in range(len(scenes)) if index not in done)
+
+
+def logs(
+    scenes: SceneSource, options: EpisodeOptions, tokenizer: MotionTokenizer | None, done: Collection[int] = ()
+) -> Iterator[Rolled]:
+    """The log of every scene; where a tokenizer is given, that of the self-driving car as its tokens have it.
+
+    Args:
+        scenes: whose logs these are.
+        options: who takes part.
+        tokenizer: of the self-driving car.
+        done: scenes to leave out.
+    """
+    for index, scene in waiting(scenes, done):
         episode = make_episode(scene, replace(options, control="sdc"))
         poses = episode.logged
         if tokenizer is not None:
             tracks = tokenizer.encode_tracks(poses, episode.logged_valid, episode.recent, episode.kind)
             poses = torch.where(episode.controlled[:, None, None], tracks.poses, poses)
-        yield index, lifted(scene, poses[None])
+        yield Rolled.of(index, scene, lifted(scene, poses[None]))
 
 
-def driven(scenes: SceneSource, model: MotionModel, options: EpisodeOptions, cfg: DictConfig) -> Rolls:
-    """Index and trajectories ``[K, A, 80, 4]`` of every scene, driven by a model.
+def driven(
+    scenes: SceneSource, model: MotionModel, options: EpisodeOptions, cfg: DictConfig, done: Collection[int] = ()
+) -> Iterator[Rolled]:
+    """Every scene, driven by a model.
 
     Args:
         scenes: to roll out.
         model: of the rollouts.
         options: of the episodes.
         cfg: with ``num_rollouts``, ``decoding``, ``seed``, ``memory`` and ``device``.
+        done: scenes to leave out.
     """
     batches = make_collector(
         scenes,
         model,
         num_rollouts=cfg.num_rollouts,
+        done=frozenset(done),
         decoding=build(Decoding, cfg.decoding, "decoding"),
         options=options,
         seed=cfg.seed,
         memory=cfg.memory,
         device=cfg.device,
     )
-    return ((each.index, each.trajectories) for each in rolled(batches, scenes, cfg.num_rollouts))
+    return rolled(batches, scenes, cfg.num_rollouts, done)
 
 
 def stored(

@@ -1,58 +1,53 @@
-"""Rows of a study, each in a file of its own, so that a killed study goes on with the next one."""
+"""What a study measures, scene by scene, kept as it comes: a killed study goes on with the next scene."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
-
 from envs.files import write_json
 from envs.progress import progress
-from envs.scene import Scene, SceneSource
+from envs.store import SceneStore
 from recipes.common.cli import finished
-from recipes.common.rolled import Rolls
+from recipes.common.partial import PartialResult
+from recipes.common.rolled import Rolled
+from recipes.common.scenes import fingerprint
 
-Look = Callable[[Scene, Tensor], Any]
-"""What is told of a scene and its trajectories ``[R, A, 80, 4]``."""
-
-
-def looked_at(scenes: SceneSource, rolls: Rolls, look: Look, name: str) -> list[Any]:
-    """What is told of every scene, in their order.
-
-    Args:
-        scenes: that the rollouts are of.
-        rolls: their rollouts, in any order.
-        look: at one scene.
-        name: of the bar.
-    """
-    found: dict[int, Any] = {}
-    with progress(total=len(scenes), description=name, unit="scene") as bar:
-        for index, trajectories in rolls:
-            found[index] = look(scenes[index], trajectories)
-            bar.update()
-    return [found[index] for index in sorted(found)]
+Roll = Callable[[frozenset[int]], Iterator[Rolled]]
+"""Rolls out the scenes that are not done, in any order."""
+Measure = Callable[[Rolled], dict[str, Any]]
+"""Numbers of one scene from its rollouts, ready for JSON."""
 
 
-def read_or_score(
-    folder: str | Path, name: str, options: Mapping[str, Any], figures: str, score: Callable[[], Any]
-) -> Any:
-    """The figures of one row: read back if it is there, scored and kept if it is not.
+def measure_row(
+    folder: str | Path, name: str, decided_by: dict[str, Any], scenes: SceneStore, roll: Roll, measure: Measure
+) -> list[dict[str, Any]]:
+    """What is measured of every scene in one row of a study; what an earlier run has measured is read back.
 
     Args:
         folder: of the study.
         name: of the row.
-        options: all that decides it.
-        figures: what they are called in its file.
-        score: makes them.
+        decided_by: all that decides it beside the scenes.
+        scenes: in the order of what is given.
+        roll: rolls them out.
+        measure: of one scene.
 
     Raises:
         ValueError: the row is there with other options.
     """
     path = Path(folder) / f"{name.replace(':', '').replace(' ', '_').replace('/', '_')}.json"
-    done = finished(path, options)
-    if done is None:
-        done = {"options": options, figures: score()}
-        write_json(path, done)
-    return done[figures]
+    options = decided_by | {"scenes": fingerprint(scenes)}
+    if (done := finished(path, options)) is not None:
+        return done["per_scene"]
+    partial = PartialResult(path, options)
+    found = partial.read()
+    with progress(total=len(scenes), description=name, initial=len(found), unit="scene") as bar:
+        for each in roll(frozenset(found)):
+            found[each.index] = measure(each)
+            partial.add({each.index: found[each.index]})
+            bar.update()
+    per_scene = [found[index] for index in range(len(scenes))]
+    write_json(path, {"options": options, "scenes": scenes.scene_ids, "per_scene": per_scene})
+    partial.remove()
+    return per_scene

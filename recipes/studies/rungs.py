@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
 
 import torch
 from torch import Tensor
 
 from dpa.rollout import lifted
 from dpa.tokens import MotionTokenizer
-from envs.scene import CURRENT_STEP, STEP_SECONDS, Scene
+from envs.scene import CURRENT_STEP, STEP_SECONDS, Scene, SceneSource
 from envs.seeding import make_generator
 from envs.sources.sumo.futures import Keeps, futures
 from envs.store import SceneStore
-from recipes.common.rolled import Rolls
+from recipes.common.rolled import Rolled, waiting
 
 Rung = Callable[[Scene, int, torch.Generator], Tensor]
 """Scene, number of rollouts and generator -> ``[R, A, 80, 4]``."""
 NOISE_XY, NOISE_HEADING = 0.1, 0.01
 """Standard deviation of a noisy log's drift in one step [m], [rad]; it adds up to 0.9 m and 5 degrees at the end."""
+
+
+def crude(
+    scenes: SceneSource, rung: Rung, num_rollouts: int, seed: int, done: Collection[int] = ()
+) -> Iterator[Rolled]:
+    """Rollouts of every scene that is not done, by a rung."""
+    for index, scene in waiting(scenes, done):
+        yield Rolled.of(index, scene, rung(scene, num_rollouts, make_generator(seed, "ladder", index)))
 
 
 def logged(scene: Scene, num_rollouts: int, generator: torch.Generator) -> Tensor:
@@ -92,12 +100,12 @@ class Simulator:
         self.scenes, self.num_rollouts, self.seed = scenes, num_rollouts, seed
         self._made: dict[tuple[int, Keeps], Tensor] = {}
 
-    def goes_on(self, keeps: Keeps, tokenizer: MotionTokenizer | None = None) -> Rolls:
-        """Its futures, through tokens and back where some are given."""
-        for index in range(len(self.scenes)):
-            scene, poses = self.scenes[index], self._futures(index, keeps)
+    def goes_on(self, keeps: Keeps, tokenizer: MotionTokenizer | None, done: Collection[int] = ()) -> Iterator[Rolled]:
+        """Its futures of the scenes that are not done, through tokens and back where some are given."""
+        for index, scene in waiting(self.scenes, done):
+            poses = self._futures(index, keeps)
             poses = poses if tokenizer is None else through(tokenizer, scene, poses)
-            yield index, lifted(scene, poses).expand(self.num_rollouts, -1, -1, -1)
+            yield Rolled.of(index, scene, lifted(scene, poses).expand(self.num_rollouts, -1, -1, -1))
 
     def _futures(self, index: int, keeps: Keeps) -> Tensor:
         """Simulated once, however many rungs ask; one alone where nothing is drawn."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,22 +12,16 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from dpa.models import Decoding, MotionModel
 from dpa.ranking import Distance
 from dpa.report.statistics import Interval, summary
-from dpa.rollout import make_collector
-from envs.episode import EpisodeOptions
-from envs.files import write_json
-from envs.progress import progress
 from envs.seeding import make_generator
 from envs.store import SceneStore
-from recipes.common.cli import build, finished, plain
+from recipes.common.cli import plain
 from recipes.common.models import open_policy, policies_of, weights_digest
-from recipes.common.partial import PartialResult
 from recipes.common.provenance import provenance
 from recipes.common.rankings import build_distance
-from recipes.common.rolled import Rolled, rolled
-from recipes.common.scenes import fingerprint
+from recipes.common.rolled import Rolled, driven
+from recipes.studies.rows import Measure, measure_row
 
 RANDOM_GROUPS = 8
 """Groups of rollouts drawn at random from a scene: what they score, a group of that size scores that nothing chose."""
@@ -34,8 +29,6 @@ ADE = "ade"
 """Displacement, the ranking that every study has beside those that it is given."""
 TAKEN = (ADE, "random")
 """Names of rankings that studies give themselves."""
-Measure = Callable[[Rolled], dict[str, Any]]
-"""Numbers of one scene from its rollouts, ready for JSON."""
 
 
 def study(cfg: DictConfig, scenes: SceneStore, measure: Measure, decided_by: dict[str, Any]) -> dict[str, list[dict]]:
@@ -64,62 +57,11 @@ def study_policy(
     model, episode, _ = open_policy(policy, cfg.device)
     options = decided_by | {
         "policy": weights_digest(model),
-        "scenes": fingerprint(scenes),
         "num_rollouts": cfg.num_rollouts,
         "decoding": plain(cfg.decoding),
         "seed": cfg.seed,
     }
-    path = Path(cfg.output) / f"{name.replace('/', '_')}.json"
-    done = finished(path, options)
-    if done is not None:
-        return done["per_scene"]
-    partial = PartialResult(path, options)
-    found = partial.read()
-    for each in rolled_out(cfg, scenes, model, episode, cfg.num_rollouts, frozenset(found), name):
-        numbers = measure(each)
-        partial.add({each.index: numbers})
-        found[each.index] = numbers
-    per_scene = [found[index] for index in range(len(scenes))]
-    write_json(path, {"options": options, "scenes": scenes.scene_ids, "per_scene": per_scene})
-    partial.remove()
-    return per_scene
-
-
-def rolled_out(
-    cfg: DictConfig,
-    scenes: SceneStore,
-    model: MotionModel,
-    options: EpisodeOptions,
-    num_rollouts: int,
-    done: frozenset[int],
-    name: str,
-) -> Iterator[Rolled]:
-    """Roll the scenes out that are not done, under a progress bar.
-
-    Args:
-        cfg: with ``decoding``, ``seed``, ``memory`` and ``device``.
-        scenes: to roll out.
-        model: that drives.
-        options: of the episodes.
-        num_rollouts: of each scene.
-        done: indices of the scenes to leave out.
-        name: of the bar.
-    """
-    batches = make_collector(
-        scenes,
-        model,
-        num_rollouts=num_rollouts,
-        done=done,
-        decoding=build(Decoding, cfg.decoding, "decoding"),
-        options=options,
-        seed=cfg.seed,
-        memory=cfg.memory,
-        device=cfg.device,
-    )
-    with progress(total=len(scenes), description=name, initial=len(done), unit="scene") as bar:
-        for each in rolled(batches, scenes, num_rollouts, done):
-            yield each
-            bar.update()
+    return measure_row(cfg.output, name, options, scenes, partial(driven, scenes, model, episode, cfg), measure)
 
 
 def distances_of(section: DictConfig, name: str) -> dict[str, Distance]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from math import isnan
 from pathlib import Path
 
 import pytest
@@ -75,7 +74,7 @@ def test_of_a_log_that_has_ended_nothing_is_known() -> None:
     scene.agents.valid[0, CURRENT_STEP + 31 :] = False
     found = look(scene, faster, METRIC)
     assert found["away [m] 2 s"] == pytest.approx(10.0) and found["collision 2 s"] == 0.0
-    assert all(isnan(found[f"{name} 8 s"]) for name in ("collision", "off-road", "away [m]"))
+    assert all(found[f"{name} 8 s"] is None for name in ("collision", "off-road", "away [m]"))
 
 
 def test_nobody_runs_into_an_agent_whose_log_has_ended() -> None:
@@ -99,7 +98,9 @@ def rows(scene: Scene, model: type[MotionLM]) -> tuple[Tensor, Tensor, Tensor]:
     tokenizer, cut = VerletTokenizer(), EpisodeOptions()
     options = OmegaConf.create({"num_rollouts": 1, "seed": 0, "device": "cpu"})
     decided = single_decisions([scene], model("nano", tokenizer), cut, Decoding(), options)
-    return tuple(next(rolls)[1][0] for rolls in (logs([scene], cut, None), logs([scene], cut, tokenizer), decided))
+    return tuple(
+        next(rolls).trajectories[0] for rolls in (logs([scene], cut, None), logs([scene], cut, tokenizer), decided)
+    )
 
 
 def test_single_decisions_of_who_knows_the_log_are_the_log_through_tokens() -> None:

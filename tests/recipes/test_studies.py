@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,13 +23,16 @@ from dpa.tokens import VerletTokenizer
 from dpa.training.loggers import read_curve
 from envs.scene import CURRENT_STEP
 from envs.sources.synthetic import straight_road
+from envs.store import SceneStore
 from recipes import validity
 from recipes.common.cli import CONFIG
 from recipes.common.models import build_policy, policies_of, policy_config, write_policy
+from recipes.common.rolled import Rolled, waiting
 from recipes.ladder import BESIDES, table
 from recipes.sensitivity import Variants
 from recipes.sensitivity import summarise as summarise_variants
-from recipes.studies.rungs import tokenized_log
+from recipes.studies.rows import measure_row
+from recipes.studies.rungs import logged, tokenized_log
 from recipes.studies.tables import StudyTable, tell
 from recipes.validity import compare_with, summarise, windows
 from tests.dpa.training.offline import wandb_history
@@ -243,6 +246,33 @@ def test_sensitivity_ranks_the_same_rollouts_by_every_variant(
     assert float(logged["Spearman"]) == mean and float(logged["Spearman low"]) == low[0]
     assert read_curve(tmp_path, "variants/Spearman/2_Hz") == [(0, mean)]
     assert (tmp_path / "pictures/variants/sensitivity/0.png").is_file()
+
+
+# --- rows -------------------------------------------------------------------------------------------------------------
+def test_a_row_that_was_cut_off_goes_on_with_the_next_scene(tmp_path: Path, stores: Path) -> None:
+    scenes, rolled, cut_at = SceneStore(stores / "eval"), [], [2]
+
+    def roll(done: frozenset[int]) -> Iterator[Rolled]:
+        for index, scene in waiting(scenes, done):
+            rolled.append(index)
+            yield Rolled.of(index, scene, logged(scene, 1, torch.Generator()))
+
+    def measure(each: Rolled) -> dict[str, int]:
+        if each.index in cut_at:
+            raise KeyboardInterrupt
+        return {"index": each.index}
+
+    def row(**decided_by: int) -> list[dict]:
+        return measure_row(tmp_path, "the log: itself", decided_by, scenes, roll, measure)
+
+    with pytest.raises(KeyboardInterrupt):
+        row(seed=0)
+    assert list(tmp_path.glob("*.json")) == [], "nothing that is not whole looks finished"
+    cut_at.clear()
+    assert row(seed=0) == row(seed=0) == [{"index": 0}, {"index": 1}, {"index": 2}] and rolled == [0, 1, 2, 2]
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["the_log_itself.json"]
+    with pytest.raises(ValueError, match=r"the_log_itself\.json was written with other options"):
+        row(seed=1)
 
 
 # --- ladder -----------------------------------------------------------------------------------------------------------
