@@ -4,7 +4,8 @@ python -m recipes.ladder scenes=gpudrive scenes.train=DIR scenes.eval=DIR polici
 
 A metric that is worth trusting puts the rungs in their order. Run the same command again to go on after a kill,
 with the next scene. Of scenes from SUMO, ``simulator=true`` adds what SUMO itself does when it goes on from the current
-step: what the logs were drawn from, by one who knows all drivers, and everybody's way or only what can be seen of it.
+step: the log again, which says what is lost on the way, and what the logs were drawn from, by one who knows all drivers
+and of their ways what can be seen.
 """
 
 from __future__ import annotations
@@ -59,8 +60,7 @@ BESIDES = {
 """What is told beside realism; of a class, over the scenes that evaluate somebody of it."""
 SIMULATOR: dict[str, Keeps] = {
     "SUMO again": "all",
-    "SUMO, other random numbers": "ways",
-    "SUMO, other ways too": "drivers",
+    "SUMO, ways drawn anew": "drivers",
 }
 """Rungs of SUMO itself, and what each keeps of the log."""
 FIGURES = ("realism", "kinematic", "interactive", "map_based", *BESIDES)

@@ -1104,7 +1104,7 @@ def test_the_ladder_of_simulated_scenes_has_rungs_of_the_simulator(
     assert outcome.status == 0, outcome.err
     found = {name: years["2024"] for name, years in json.loads(out.read_text())["rungs"].items()}
     (spread,) = zip(*(found[name]["spread"] for name in SIMULATOR), strict=True)
-    assert spread[0] == 0 < spread[1] < spread[2], "what is known of the log narrows its futures"
+    assert spread[0] == 0 < spread[1], "what is known of the log narrows its futures"
     assert set(rungs_of_sumo) < set(found) and found["SUMO again"]["min_ade"][0] < 0.5
     refused = run("ladder", *command, f"output={tmp_path / 'roads'}")
     assert refused.status == 2 and "simulator=true needs scenes that SUMO has simulated" in refused.err
