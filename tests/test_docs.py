@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 from dpa.models.registry import FAMILIES
 from dpa.ranking import AGGREGATES, FEATURES, SOLVERS
 from dpa.report.likelihoods import who_learns
-from dpa.report.statistics import paired_bootstrap
+from dpa.report.statistics import paired_bootstrap, summary
 from dpa.report.study import Evaluations, Study, read_study
 from dpa.report.table import difference, number
 from dpa.report.text import (
@@ -475,3 +475,32 @@ def test_a_reader_gets_the_intervals_of_a_study_from_the_values_of_its_scenes(st
 
 if __name__ == "__main__":
     pytest.main([__file__])
+
+
+RUNGS = {
+    "log": "log",
+    "SUMO again": "SUMO again",
+    "SUMO, ways drawn anew": "SUMO, ways drawn anew",
+    "the same through the policies' tokens": "SUMO, ways drawn anew, through tokens",
+    "log through tokens": "log through tokens",
+    "constant velocity": "constant velocity",
+}
+"""Rows of the table of the simulator, and the rungs that they are of."""
+
+
+def test_the_table_of_the_simulator_is_of_the_ladder_beside_it() -> None:
+    with zipfile.ZipFile(REPOSITORY / "docs/studies/ladder.zip") as archive:
+        ladder = json.loads(archive.read("ladder/ladder.json"))["rungs"]
+    page = (REPOSITORY / "docs/studies/metric.md").read_text(encoding="utf-8")
+    section = page.partition("## What the simulator itself gets")[2].partition("\n## ")[0]
+    measures = ("kinematic", "interactive", "map_based", "min_ade", "collision_rate", "offroad_rate", "spread")
+    for row, rung in RUNGS.items():
+        (told,) = re.findall(rf"^\| {re.escape(row)} \| (.*) \|$", section, re.MULTILINE)
+        realism, *others = told.split(" | ")
+        values = ladder[rung]["2024"]
+        found = summary([values["realism"]])
+        assert realism == f"{found.mean:.3f} [{found.low:.3f}, {found.high:.3f}]", row
+        for measure, cell in zip(measures, others, strict=True):
+            known = [value for value in values[measure] if value is not None]
+            digits = len(cell.partition(".")[2])
+            assert cell == f"{sum(known) / len(known):.{digits}f}", (row, measure)
