@@ -794,6 +794,12 @@ def test_ways_of_traffic_of_ones_own_cannot_be_drawn() -> None:
         futures("net=a.net.xml,routes=a.rou.xml,number=0,num_scenes=1", scene, [0], keeps="drivers")
 
 
+def test_what_a_future_keeps_is_one_of_three(resumed: tuple) -> None:
+    unit, scene = resumed
+    with pytest.raises(ValueError, match=r"keeps must be one of all, ways, drivers, got 'driver'\."):
+        futures(unit.text, scene, [0], keeps="driver")
+
+
 def test_a_scene_of_another_simulation_has_no_future_in_this_one(resumed: tuple) -> None:
     unit, scene = resumed
     other = replace(unit, number=unit.number + 1)

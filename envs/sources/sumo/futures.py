@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 from xml.etree import ElementTree
 
 import numpy as np
@@ -57,8 +57,8 @@ def futures(origin: str, scene: Scene, seeds: Sequence[int], *, keeps: Keeps = "
 
     Raises:
         ImportError: the extra ``sumo`` is not installed.
-        ValueError: the scene is of another simulation, or the simulation of another version of SUMO; or ways are to be
-            drawn for traffic that is the user's own.
+        ValueError: the scene is of another simulation, or the simulation of another version of SUMO; ways are to be
+            drawn for traffic that is the user's own; or there is no such ``keeps``.
         SceneError: a file of the user's own cannot be used.
 
     Examples:
@@ -68,6 +68,8 @@ def futures(origin: str, scene: Scene, seeds: Sequence[int], *, keeps: Keeps = "
         >>> futures(unit.text, scene, seeds=[0, 1]).shape
         torch.Size([2, 8, 80, 3])
     """
+    if keeps not in get_args(Keeps):
+        raise ValueError(f"keeps must be one of {', '.join(get_args(Keeps))}, got {keeps!r}.")
     unit = read_unit(origin)
     if keeps == "drivers" and unit.routes:
         raise ValueError(f"{origin}: only random traffic says which ways are possible; keep them (keeps='ways').")
