@@ -108,7 +108,8 @@ def test_scenes_that_do_not_exist_are_told_by_path(
     run: Callable, options: Callable, recipe: str, tmp_path: Path
 ) -> None:
     more = [] if recipe in WITHOUT_POLICY else [f"policy={NANO}"]
-    more += {"play": [f"policies={NANO}"], "compare": ["alignment.snapshots=[2]"]}.get(recipe, [])
+    more += [f"policies={NANO}"] if recipe in ("play", *SEVERAL) else []
+    more += ["alignment.snapshots=[2]"] if recipe == "compare" else []
     name = "out.html" if recipe == "play" else "out"
     command = options(recipe, *more, "scenes.train=nowhere", f"{output_of(recipe)}={tmp_path / name}")
     assert_refused(run(recipe, *command), "nowhere")
