@@ -80,7 +80,7 @@ def measure_scene(each: Rolled, metrics: Mapping[str, RealismConfig]) -> dict[st
 
 
 def rungs(cfg: DictConfig, scenes: SceneStore) -> Iterator[tuple[str, dict[str, Any], Roll]]:
-    """Name, what decides it, and rollouts of each rung, from the best to expect to the worst."""
+    """Name, what decides it, and rollouts of each rung: the log, what is crude, the simulator, models."""
     count, seed = cfg.num_rollouts, cfg.seed
     sumo = Simulator(scenes, count, seed) if cfg.simulator else None
     config = policy_config(cfg.model)

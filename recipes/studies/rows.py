@@ -34,11 +34,13 @@ def measure_row(
         measure: of one scene.
 
     Raises:
-        ValueError: the row is there with other options.
+        ValueError: the row is there with other options, or from an earlier version.
     """
     path = Path(folder) / f"{name.replace(':', '').replace(' ', '_').replace('/', '_')}.json"
     options = decided_by | {"scenes": fingerprint(scenes)}
     if (done := finished(path, options)) is not None:
+        if "per_scene" not in done:
+            raise ValueError(f"{path} was written by an earlier version; name another folder, or remove it.")
         return done["per_scene"]
     partial = PartialResult(path, options)
     found = partial.read()

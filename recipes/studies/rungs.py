@@ -91,12 +91,14 @@ class Simulator:
         seed: of all that is drawn.
 
     Raises:
-        ValueError: scenes of another source.
+        ValueError: scenes of another source, or of traffic with routes of the user's own.
     """
 
     def __init__(self, scenes: SceneStore, num_rollouts: int, seed: int) -> None:
         if sources := sorted({each["source"] for each in scenes.origins()} - {"sumo"}):
             raise ValueError(f"simulator=true needs scenes that SUMO has simulated, got some of {', '.join(sources)}.")
+        if own := [named for each in scenes.origins() for named in each["named"] if "routes=" in named]:
+            raise ValueError(f"simulator=true draws ways anew, which only random traffic has; {own[0]!r} has routes.")
         self.scenes, self.num_rollouts, self.seed = scenes, num_rollouts, seed
         self._made: dict[tuple[int, Keeps], Tensor] = {}
 
@@ -108,12 +110,13 @@ class Simulator:
             yield Rolled.of(index, scene, lifted(scene, poses).expand(self.num_rollouts, -1, -1, -1))
 
     def _futures(self, index: int, keeps: Keeps) -> Tensor:
-        """Simulated once, however many rungs ask; one alone where nothing is drawn."""
-        if (index, keeps) not in self._made:
-            scene, count = self.scenes[index], 1 if keeps == "all" else self.num_rollouts
-            draw = make_generator(self.seed, "simulator", scene.scene_id)
-            seeds = torch.randint(2**31 - 1, (count,), generator=draw).tolist()
-            self._made[index, keeps] = futures(self.scenes.provenance(index)[0], scene, seeds, keeps=keeps)
+        """Simulated once for the two rungs that ask, and then let go; one alone where nothing is drawn."""
+        if (index, keeps) in self._made:
+            return self._made.pop((index, keeps))
+        scene, count = self.scenes[index], 1 if keeps == "all" else self.num_rollouts
+        draw = make_generator(self.seed, "simulator", scene.scene_id)
+        seeds = torch.randint(2**31 - 1, (count,), generator=draw).tolist()
+        self._made[index, keeps] = futures(self.scenes.provenance(index)[0], scene, seeds, keeps=keeps)
         return self._made[index, keeps]
 
 

@@ -788,10 +788,32 @@ def test_other_ways_make_other_futures(resumed: tuple) -> None:
     assert torch.equal(other[1], futures(unit.text, scene, [2], keeps="drivers")[0])
 
 
-def test_ways_of_traffic_of_ones_own_cannot_be_drawn() -> None:
-    scene = next(sumo.generate(1, seed=5, preset="town", windows=1, warmup=10.0))
+@pytest.mark.parametrize("warmup", [15.0, 15.05])
+def test_a_scene_of_a_later_window_goes_on_from_its_own_step(warmup: float) -> None:
+    (unit,) = sumo.units(2, seed=3, preset="roundabout", windows=2, warmup=warmup, scenes_per_unit=2, density=1.5)
+    scene = next(scene for scene in sumo.simulate(unit) if "_100_" in scene.scene_id)
+    (again,) = futures(unit.text, scene, [0], keeps="all")
+    log, valid = poses_ahead(scene)
+    first = ((again[:, 0, :2] - log[:, 0]).norm(dim=-1))[valid[:, 0]]
+    assert first.quantile(0.8) < 0.1, "a step of a car at 5 m/s is 0.5 m"
+
+
+def test_on_a_motorway_a_way_out_is_as_likely_as_it_has_lanes() -> None:
+    told = {name: sumo.exits_by_lane(sumo.units(1, preset=name)[0]) for name in ("motorway", "grid")}
+    assert told == {"motorway": True, "grid": False}
+
+
+def test_in_a_junction_the_next_street_is_settled() -> None:
+    assert Driver("1", ("a", "b", "c"), 0, ":j_0_0").settled == ("a", "b")
+    assert Driver("1", ("a", "b", "c"), 0, "a_0").settled == ("a",)
+
+
+def test_what_cannot_go_on_with_traffic_of_ones_own_is_refused() -> None:
+    scene, own = next(sumo.generate(1, seed=5, preset="town", windows=1, warmup=10.0)), "net=a.net.xml,routes=a.rou.xml"
     with pytest.raises(ValueError, match="only random traffic says which ways are possible"):
-        futures("net=a.net.xml,routes=a.rou.xml,number=0,num_scenes=1", scene, [0], keeps="drivers")
+        futures(f"{own},number=0,num_scenes=1", scene, [0], keeps="drivers")
+    with pytest.raises(ValueError, match="SUMO cannot go on with routes that density scales"):
+        futures(f"{own},number=0,num_scenes=1,density=1.5", scene, [0])
 
 
 def test_what_a_future_keeps_is_one_of_three(resumed: tuple) -> None:

@@ -39,7 +39,7 @@ RECIPES = (
     "compare", "validity", "sensitivity",
 )  # fmt: skip
 NANO = "zoo:motionlm-nano-sumo"
-SEVERAL = ("gap", "encounters", "ladder", "references", "validity", "sensitivity", "discriminator")
+SEVERAL = ("gap", "encounters", "ladder", "references", "validity", "sensitivity", "discriminator", "play")
 """Recipes that are given several policies."""
 WITHOUT_POLICY = tuple(recipe for recipe in RECIPES if recipe not in ("collect", "align", "evaluate"))
 pytestmark = pytest.mark.usefixtures("stores")
@@ -108,7 +108,7 @@ def test_scenes_that_do_not_exist_are_told_by_path(
     run: Callable, options: Callable, recipe: str, tmp_path: Path
 ) -> None:
     more = [] if recipe in WITHOUT_POLICY else [f"policy={NANO}"]
-    more += [f"policies={NANO}"] if recipe in ("play", *SEVERAL) else []
+    more += [f"policies={NANO}"] if recipe in SEVERAL else []
     more += ["alignment.snapshots=[2]"] if recipe == "compare" else []
     name = "out.html" if recipe == "play" else "out"
     command = options(recipe, *more, "scenes.train=nowhere", f"{output_of(recipe)}={tmp_path / name}")

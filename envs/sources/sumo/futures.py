@@ -26,8 +26,8 @@ from envs.sources.sumo.xml import read_xml
 
 Keeps = Literal["all", "ways", "drivers"]
 """What a future has of its log: its random numbers too, so that it is the log again but for what a saved state lacks
-(who waits at a stop sign waits anew); every driver and everybody's way; or the drivers, and of vehicles and cyclists
-ways that they may be on for all that one sees (:mod:`envs.sources.sumo.ways`)."""
+(who waits at a stop sign waits anew); every driver and everybody's way; or the drivers, and of the scene's vehicles
+and cyclists ways that they may be on for all that one sees (:mod:`envs.sources.sumo.ways`)."""
 
 FUTURE_STEPS = LOG_STEPS - CURRENT_STEP - 1
 SPARE_STEPS = KERNEL_REACH + 1
@@ -58,7 +58,7 @@ def futures(origin: str, scene: Scene, seeds: Sequence[int], *, keeps: Keeps = "
     Raises:
         ImportError: the extra ``sumo`` is not installed.
         ValueError: the scene is of another simulation, or the simulation of another version of SUMO; ways are to be
-            drawn for traffic that is the user's own; or there is no such ``keeps``.
+            drawn for traffic that is the user's own, or it was scaled; or there is no such ``keeps``.
         SceneError: a file of the user's own cannot be used.
 
     Examples:
@@ -73,6 +73,8 @@ def futures(origin: str, scene: Scene, seeds: Sequence[int], *, keeps: Keeps = "
     unit = read_unit(origin)
     if keeps == "drivers" and unit.routes:
         raise ValueError(f"{origin}: only random traffic says which ways are possible; keep them (keeps='ways').")
+    if unit.routes and unit.options.density != 1:
+        raise ValueError(f"{origin}: SUMO cannot go on with routes that density scales; convert with density=1.")
     first = int(scene.scene_id.split("_")[-2])  # see `simulate`
     now = first + CURRENT_STEP
     with tempfile.TemporaryDirectory(prefix="sumo_") as name:
@@ -108,7 +110,9 @@ def _saved(
 
 def _resumed(run: Run, now: int, state: Path) -> Run:
     """The simulation from a step of its recording on."""
-    begin = round(run.begin + run.warmup + now * STEP_SECONDS, 1)
+    recorded_from = round((run.begin + run.warmup) / STEP_SECONDS)  # as in `simulate_traffic`
+    steps = recorded_from + now - round(run.begin / STEP_SECONDS)
+    begin = round(run.begin + steps * STEP_SECONDS, 3)
     duration = (1 + FUTURE_STEPS + SPARE_STEPS) * STEP_SECONDS
     return replace(run, begin=begin, warmup=0.0, duration=duration, options=run.options | {"load-state": state})
 

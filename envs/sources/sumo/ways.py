@@ -35,8 +35,8 @@ class Driver:
     lane: str
 
     @property
-    def behind(self) -> Way:
-        """The streets that are behind it or that it cannot help taking."""
+    def settled(self) -> Way:
+        """The streets that it has driven, is on, or cannot help taking next."""
         return self.way[: self.here + (2 if self.lane.startswith(":") else 1)]
 
 
@@ -47,7 +47,8 @@ def possible_ways(
 
     Random traffic draws a trip's end among the ways out, alike, and takes the fastest way there. So those are possible
     that begin as the driver's own way has and that go on from its lane; where its own way asks for another lane, it is
-    about to change to it, and the next street is known.
+    about to change to it, and the next street is known. Only the next street is held against the lane, and other ends
+    have the fastest way of an empty road.
 
     Args:
         state: saved by SUMO.
@@ -73,7 +74,7 @@ def possible_ways(
         for end, share in ends[driver.name].items():
             own = end == trips[driver.name].get("to")  # the fastest, when it set out
             way = driver.way if own else fastest.get((driver.name, end), ())
-            if way[: len(driver.behind)] == driver.behind and can_take(driver, way, leads):
+            if way[: len(driver.settled)] == driver.settled and can_take(driver, way, leads):
                 found[way] += share
         possible[driver.name] = {way: share / found.total() for way, share in found.items()}
     return possible
@@ -115,13 +116,12 @@ def can_take(driver: Driver, way: Way, leads: Collection[tuple[str, str]]) -> bo
     Args:
         driver: somewhere.
         way: that begins as the driver's own.
-        leads: pairs of a lane and a street behind it.
+        leads: pairs of a lane and a street that it leads to.
     """
-    ahead = len(driver.behind)
+    ahead = len(driver.settled)
     if driver.lane.startswith(":") or way[ahead : ahead + 1] == driver.way[ahead : ahead + 1]:
         return True
-    on_lane = [not each[ahead:] or (driver.lane, each[ahead]) in leads for each in (way, driver.way)]
-    return all(on_lane)
+    return all(not each[ahead:] or (driver.lane, each[ahead]) in leads for each in (way, driver.way))
 
 
 def _fastest(
