@@ -10,8 +10,9 @@ next scene.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import hydra
@@ -24,7 +25,7 @@ from envs.files import write_json
 from envs.scene import AgentKind, Scene
 from envs.store import SceneStore
 from recipes.common.cli import CONFIG, plain, recipe
-from recipes.common.models import given_policies, open_policy, policies_of, weights_digest
+from recipes.common.models import given_policies, open_policy, weights_digest
 from recipes.common.rolled import driven, logs
 from recipes.common.scenes import open_splits
 from recipes.studies.rows import Roll, measure_row
@@ -64,16 +65,16 @@ def look(scene: Scene, trajectories: Tensor, metric: RealismConfig) -> dict[str,
     return found
 
 
-def rows(cfg: DictConfig, scenes: SceneStore) -> Iterator[tuple[str, dict[str, Any], Roll]]:
+def rows(cfg: DictConfig, files: Mapping[str, Path], scenes: SceneStore) -> Iterator[tuple[str, dict[str, Any], Roll]]:
     """Name of each row, what decides it, and its rollouts: the log, then the policies."""
     yield "log", {}, partial(logs, scenes, EpisodeOptions(), None)
-    for name, path in policies_of(cfg).items():
+    for name, path in files.items():
         model, options, config = open_policy(path, cfg.device)
         told = {"policy": weights_digest(model), **config, "decoding": plain(cfg.decoding), "seed": cfg.seed}
         yield name, told | {"num_rollouts": cfg.num_rollouts}, partial(driven, scenes, model, options, cfg)
 
 
-def measure_encounters(cfg: DictConfig, scenes: SceneStore) -> dict[str, Figures]:
+def measure_encounters(cfg: DictConfig, files: Mapping[str, Path], scenes: SceneStore) -> dict[str, Figures]:
     """Measure every row, or read it back.
 
     Raises:
@@ -81,7 +82,7 @@ def measure_encounters(cfg: DictConfig, scenes: SceneStore) -> dict[str, Figures
     """
     metric, found = RealismConfig.load(str(cfg.metric)), {}
     common = {"metric": metric.describe()}
-    for name, own, roll in rows(cfg, scenes):
+    for name, own, roll in rows(cfg, files, scenes):
         measured = measure_row(
             cfg.output, name, common | own, scenes, roll, lambda each: look(each.scene, each.trajectories, metric)
         )
@@ -123,7 +124,7 @@ def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.encounters``."""
     policies = given_policies(cfg)
     scenes = open_splits(cfg.scenes)[cfg.split]
-    found = measure_encounters(cfg, scenes)
+    found = measure_encounters(cfg, policies, scenes)
     tell(cfg, list(tables(found, list(policies))), {})
     if cfg.json is not None:
         write_json(cfg.json, {"scenes": len(scenes), "rows": found})

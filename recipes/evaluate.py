@@ -16,7 +16,7 @@ import torch
 from omegaconf import DictConfig
 
 from dpa.models import Decoding
-from dpa.ranking import Distance, agent_spread
+from dpa.ranking import Distance
 from dpa.realism import CLASS_RATES, RealismConfig, RealismResult, class_rates, mean_result, realism
 from dpa.realism.submission import SubmissionWriter, plan_submission
 from dpa.rollout import make_collector
@@ -29,7 +29,7 @@ from recipes.common.cli import CONFIG, build, deciding, finished, finite, mean_k
 from recipes.common.models import given_policy, open_policy, weights_digest
 from recipes.common.partial import PartialResult
 from recipes.common.rankings import build_distance
-from recipes.common.rolled import Rolled, rolled
+from recipes.common.rolled import Rolled, final_spread, rolled
 from recipes.common.scenes import fingerprint, open_splits
 
 STANDING, MOVED = 0.5, 2.0
@@ -172,20 +172,6 @@ def standing_moved(scene: Any, trajectories: torch.Tensor) -> float:
         return float("nan")
     moved = (trajectories[:, standing, -1, :2] - xy[standing, 0]).norm(dim=-1) > MOVED
     return moved.float().mean().item()
-
-
-def final_spread(scene: Any, trajectories: torch.Tensor, controlled: torch.Tensor) -> float:
-    """How far apart rollouts end, small where sampling is sharp [m] (NaN: no evaluated agent is controlled).
-
-    The mean of :func:`dpa.ranking.agent_spread` over evaluated agents that the policy controls.
-
-    Args:
-        scene: uncollated.
-        trajectories: ``[K, A, T * F, 4]`` of the present agents.
-        controlled: ``[A]`` bool.
-    """
-    agents = scene.agents
-    return agent_spread(trajectories[:, agents.evaluated[agents.present] & controlled]).mean().item()
 
 
 @hydra.main(**CONFIG, config_name="evaluate")

@@ -14,9 +14,10 @@ kill, with the next scene.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import hydra
@@ -37,7 +38,7 @@ from envs.scene import STEP_SECONDS, Scene, SceneSource, select_agents
 from envs.seeding import make_generator
 from envs.store import SceneStore
 from recipes.common.cli import CONFIG, build, plain, recipe
-from recipes.common.models import given_policies, open_policy, policies_of, weights_digest
+from recipes.common.models import given_policies, open_policy, weights_digest
 from recipes.common.rolled import Rolled, driven, logs, waiting
 from recipes.common.scenes import open_splits
 from recipes.studies.rows import Roll, measure_row
@@ -79,14 +80,14 @@ def single_decisions(
         )
 
 
-def rows(cfg: DictConfig, scenes: SceneStore) -> Iterator[tuple[str, dict[str, Any], Roll]]:
+def rows(cfg: DictConfig, files: Mapping[str, Path], scenes: SceneStore) -> Iterator[tuple[str, dict[str, Any], Roll]]:
     """Name of each row, what decides it, and its rollouts.
 
     Raises:
         ValueError: policies with different tokens, which would need a log each.
     """
     decoding, told = build(Decoding, cfg.decoding, "decoding"), {"decoding": plain(cfg.decoding)}
-    policies = {name: open_policy(path, cfg.device) for name, path in policies_of(cfg).items()}
+    policies = {name: open_policy(path, cfg.device) for name, path in files.items()}
     model, options, first = next(iter(policies.values()))
     for name, (_, _, config) in policies.items():
         if differ := differences(config["tokenizer"], first["tokenizer"]):
@@ -151,7 +152,9 @@ def _last(seconds: float) -> int:
     return round(seconds / STEP_SECONDS) - 1
 
 
-def measure_gap(cfg: DictConfig, scenes: SceneStore) -> dict[str, dict[str, list[float | None]]]:
+def measure_gap(
+    cfg: DictConfig, files: Mapping[str, Path], scenes: SceneStore
+) -> dict[str, dict[str, list[float | None]]]:
     """Measure every row, or read it back; ``{row: {figure: one value per scene}}``.
 
     Raises:
@@ -159,7 +162,7 @@ def measure_gap(cfg: DictConfig, scenes: SceneStore) -> dict[str, dict[str, list
     """
     metric, gap = RealismConfig.load(str(cfg.metric)), {}
     common = {"num_rollouts": cfg.num_rollouts, "seed": cfg.seed, "metric": metric.describe()}
-    for name, own, roll in rows(cfg, scenes):
+    for name, own, roll in rows(cfg, files, scenes):
         measured = measure_row(
             cfg.output, name, common | own, scenes, roll, lambda each: look(each.scene, each.trajectories, metric)
         )
@@ -196,7 +199,7 @@ def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.gap``."""
     policies = given_policies(cfg)
     scenes = open_splits(cfg.scenes)[cfg.split]
-    gap = measure_gap(cfg, scenes)
+    gap = measure_gap(cfg, policies, scenes)
     tell(cfg, tables(gap, list(policies), len(scenes)), {})
     if cfg.json is not None:
         write_json(cfg.json, {"scenes": len(scenes), "rows": gap})

@@ -13,13 +13,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from functools import partial
 from itertools import compress
+from pathlib import Path
 from typing import Any
 
 import hydra
 import numpy as np
 from omegaconf import DictConfig
 
-from dpa.ranking import agent_spread
 from dpa.realism import CLASS_RATES, RealismConfig, class_rates, realism
 from dpa.report.statistics import summary
 from dpa.training.seeding import seed_everything
@@ -32,11 +32,10 @@ from recipes.common.models import (
     fresh_policy,
     given_policies,
     open_policy,
-    policies_of,
     policy_config,
     weights_digest,
 )
-from recipes.common.rolled import Rolled, driven
+from recipes.common.rolled import Rolled, driven, final_spread
 from recipes.common.scenes import open_splits
 from recipes.studies.rows import Roll, measure_row
 from recipes.studies.rungs import (
@@ -69,9 +68,7 @@ FIGURES = ("realism", "kinematic", "interactive", "map_based", *BESIDES)
 
 def measure_scene(each: Rolled, metrics: Mapping[str, RealismConfig]) -> dict[str, dict[str, float | None]]:
     """``{year: {figure: value}}``; None where a scene has none."""
-    agents = each.scene.agents
-    spread = agent_spread(each.trajectories[:, agents.evaluated[agents.present]]).mean().item()
-    found = {}
+    found, spread = {}, final_spread(each.scene, each.trajectories, each.controlled)
     for year, metric in metrics.items():
         result = realism(each.scene, each.trajectories, metric, features=True)
         figures = result.as_dict() | class_rates(result.features, metric) | {"spread": spread}
@@ -79,7 +76,9 @@ def measure_scene(each: Rolled, metrics: Mapping[str, RealismConfig]) -> dict[st
     return found
 
 
-def rungs(cfg: DictConfig, scenes: SceneStore) -> Iterator[tuple[str, dict[str, Any], Roll]]:
+def rungs(
+    cfg: DictConfig, policies: Mapping[str, Path], scenes: SceneStore
+) -> Iterator[tuple[str, dict[str, Any], Roll]]:
     """Name, what decides it, and rollouts of each rung: the log, what is crude, the simulator, models."""
     count, seed = cfg.num_rollouts, cfg.seed
     sumo = Simulator(scenes, count, seed) if cfg.simulator else None
@@ -88,7 +87,7 @@ def rungs(cfg: DictConfig, scenes: SceneStore) -> Iterator[tuple[str, dict[str, 
     untrained = fresh_policy(cfg.model)
     decoding = {"decoding": plain(cfg.decoding)}
     models = {"untrained model": (untrained, episode_options(cfg.model), config)}
-    for name, path in (policies_of(cfg) if cfg.policies else {}).items():
+    for name, path in policies.items():
         models[name] = open_policy(path, cfg.device)
     made = {
         "log": logged,
@@ -108,7 +107,7 @@ def rungs(cfg: DictConfig, scenes: SceneStore) -> Iterator[tuple[str, dict[str, 
         yield name, decoding | {"policy": weights_digest(model), **config}, partial(driven, scenes, model, episode, cfg)
 
 
-def climb(cfg: DictConfig, scenes: SceneStore) -> dict[str, dict]:
+def climb(cfg: DictConfig, policies: Mapping[str, Path], scenes: SceneStore) -> dict[str, dict]:
     """Measure every rung, or read it back; ``{rung: {year: {figure: one value per scene}}}``.
 
     Raises:
@@ -124,7 +123,7 @@ def climb(cfg: DictConfig, scenes: SceneStore) -> dict[str, dict]:
         "figures": list(FIGURES),
     }
     ladder = {}
-    for name, own, roll in rungs(cfg, scenes):
+    for name, own, roll in rungs(cfg, policies, scenes):
         measured = measure_row(cfg.output, name, common | own, scenes, roll, partial(measure_scene, metrics=metrics))
         ladder[name] = {year: {key: [each[year][key] for each in measured] for key in FIGURES} for year in metrics}
     return ladder
@@ -162,10 +161,9 @@ def table(ladder: dict[str, dict], years: list[str]) -> StudyTable:
 @recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.ladder``."""
-    if cfg.policies:
-        given_policies(cfg)
+    policies = given_policies(cfg) if cfg.policies else {}
     scenes = open_splits(cfg.scenes)[cfg.split]
-    ladder, years = climb(cfg, scenes), years_of(cfg)
+    ladder, years = climb(cfg, policies, scenes), years_of(cfg)
     tell(cfg, [table(ladder, years)], {})
     if cfg.json is not None:
         write_json(cfg.json, {"scenes": len(scenes), "years": years, "rungs": ladder})

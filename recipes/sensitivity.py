@@ -189,10 +189,10 @@ def main(cfg: DictConfig) -> None:
     distances = distances_of(cfg.rankings, "rankings")
     if cfg.baseline not in distances:
         raise ValueError(f"baseline must be one of the rankings {', '.join(distances)}, got {cfg.baseline!r}.")
-    given_policies(cfg)
+    policies = given_policies(cfg)
     scenes = open_splits(cfg.scenes)[cfg.split]
     decided_by = {"rankings": {name: distance.describe() for name, distance in distances.items()}}
-    measured = study(cfg, scenes, lambda each: measure_scene(each, distances), decided_by)
+    measured = study(cfg, policies, scenes, lambda each: measure_scene(each, distances), decided_by)
     variants = Variants(measured, cfg.baseline)
     found, folder = summarise(variants), Path(cfg.output)
     agreement = {name: values["correlation"] for name, values in found["variants"].items()}

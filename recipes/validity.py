@@ -174,7 +174,7 @@ def main(cfg: DictConfig) -> None:
     if cfg.against not in (*distances, ADE):
         raise ValueError(f"against must be one of {', '.join((*distances, ADE))}, got {cfg.against!r}.")
     metric = RealismConfig.load(str(cfg.metric))
-    given_policies(cfg)
+    policies = given_policies(cfg)
     scenes = open_splits(cfg.scenes)[cfg.split]
     decided_by = {
         "window": cfg.window,
@@ -184,6 +184,7 @@ def main(cfg: DictConfig) -> None:
     }
     measured = study(
         cfg,
+        policies,
         scenes,
         lambda each: measure_scene(each, distances, cfg.window, cfg.stride, metric, cfg.seed),
         decided_by,

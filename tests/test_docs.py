@@ -473,10 +473,6 @@ def test_a_reader_gets_the_intervals_of_a_study_from_the_values_of_its_scenes(st
             assert [again.low, again.high] == pytest.approx(entry["ci95"], abs=1e-9)
 
 
-if __name__ == "__main__":
-    pytest.main([__file__])
-
-
 RUNGS = {
     "log": "log",
     "SUMO again": "SUMO again",
@@ -504,3 +500,7 @@ def test_the_table_of_the_simulator_is_of_the_ladder_beside_it() -> None:
             known = [value for value in values[measure] if value is not None]
             digits = len(cell.partition(".")[2])
             assert cell == f"{sum(known) / len(known):.{digits}f}", (row, measure)
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])

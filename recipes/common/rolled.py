@@ -13,6 +13,7 @@ from torch import Tensor
 
 from dpa.models import Decoding, MotionModel
 from dpa.preferences import PreferenceStore
+from dpa.ranking import agent_spread
 from dpa.rollout import lifted, make_collector, simulated_poses
 from dpa.tokens import MotionTokenizer
 from envs import keys
@@ -40,6 +41,20 @@ class Rolled(NamedTuple):
     def of(cls, index: int, scene: Scene, trajectories: Tensor) -> Rolled:
         """All agents are controlled."""
         return cls(index, scene, trajectories, torch.ones(trajectories.shape[1], dtype=torch.bool))
+
+
+def final_spread(scene: Scene, trajectories: Tensor, controlled: Tensor) -> float:
+    """How far apart rollouts end, small where sampling is sharp [m] (NaN: no evaluated agent is controlled).
+
+    The mean of :func:`dpa.ranking.agent_spread` over evaluated agents that the policy controls.
+
+    Args:
+        scene: uncollated.
+        trajectories: ``[K, A, T * F, 4]`` of the present agents.
+        controlled: ``[A]`` bool.
+    """
+    agents = scene.agents
+    return agent_spread(trajectories[:, agents.evaluated[agents.present] & controlled]).mean().item()
 
 
 def rolled(

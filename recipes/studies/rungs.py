@@ -111,8 +111,8 @@ class Simulator:
 
     def _futures(self, index: int, keeps: Keeps) -> Tensor:
         """Simulated once for the two rungs that ask, and then let go; one alone where nothing is drawn."""
-        if (index, keeps) in self._made:
-            return self._made.pop((index, keeps))
+        if (made := self._made.pop((index, keeps), None)) is not None:
+            return made
         scene, count = self.scenes[index], 1 if keeps == "all" else self.num_rollouts
         draw = make_generator(self.seed, "simulator", scene.scene_id)
         seeds = torch.randint(2**31 - 1, (count,), generator=draw).tolist()

@@ -17,7 +17,7 @@ from dpa.report.statistics import Interval, summary
 from envs.seeding import make_generator
 from envs.store import SceneStore
 from recipes.common.cli import plain
-from recipes.common.models import open_policy, policies_of, weights_digest
+from recipes.common.models import open_policy, weights_digest
 from recipes.common.provenance import provenance
 from recipes.common.rankings import build_distance
 from recipes.common.rolled import Rolled, driven
@@ -31,23 +31,22 @@ TAKEN = (ADE, "random")
 """Names of rankings that studies give themselves."""
 
 
-def study(cfg: DictConfig, scenes: SceneStore, measure: Measure, decided_by: dict[str, Any]) -> dict[str, list[dict]]:
+def study(
+    cfg: DictConfig, policies: Mapping[str, Path], scenes: SceneStore, measure: Measure, decided_by: dict[str, Any]
+) -> dict[str, list[dict]]:
     """Measure every scene under every policy; what an earlier run has measured is read back.
 
     Args:
-        cfg: with ``policies``, ``num_rollouts``, ``decoding``, ``seed``, ``memory``, ``device`` and ``output``.
+        cfg: with ``num_rollouts``, ``decoding``, ``seed``, ``memory``, ``device`` and ``output``.
+        policies: files by name.
         scenes: to roll out.
         measure: of one scene.
         decided_by: options of the measure.
 
     Returns:
         For each policy by name what ``measure`` gave for each scene.
-
-    Raises:
-        ValueError: no policy is given.
     """
-    policies = policies_of(cfg).items()
-    return {name: study_policy(cfg, scenes, path, measure, decided_by, name) for name, path in policies}
+    return {name: study_policy(cfg, scenes, path, measure, decided_by, name) for name, path in policies.items()}
 
 
 def study_policy(

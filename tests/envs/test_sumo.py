@@ -35,7 +35,7 @@ from envs.scene import (
 from envs.sources import sumo
 from envs.sources.sumo.classes import CLASSES
 from envs.sources.sumo.cut import cut_map
-from envs.sources.sumo.demand import draw_types
+from envs.sources.sumo.demand import draw_types, exits_by_lane
 from envs.sources.sumo.futures import futures
 from envs.sources.sumo.makers import make_network
 from envs.sources.sumo.netmap import GUTTER, NetMap, build_map
@@ -799,7 +799,8 @@ def test_a_scene_of_a_later_window_goes_on_from_its_own_step(warmup: float) -> N
 
 
 def test_on_a_motorway_a_way_out_is_as_likely_as_it_has_lanes() -> None:
-    told = {name: sumo.exits_by_lane(sumo.units(1, preset=name)[0]) for name in ("motorway", "grid")}
+    rules = {name: sumo.rules_of(sumo.units(1, preset=name)[0]) for name in ("motorway", "grid")}
+    told = {name: exits_by_lane(each["traffic"]) for name, each in rules.items()}
     assert told == {"motorway": True, "grid": False}
 
 

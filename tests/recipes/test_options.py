@@ -452,7 +452,8 @@ def test_what_is_not_there_is_told_before_any_scene_is_converted(
         f'scenes.eval="{made},split=test"',
         f"scenes.cache={tmp_path / 'c'}",
     ]
-    more = [f"{output_of(recipe)}={tmp_path / 'out'}", *(["preferences=none"] if recipe in ("align", "rerank") else [])]
+    name = "out.html" if recipe == "play" else "out"
+    more = [f"{output_of(recipe)}={tmp_path / name}", *(["preferences=none"] if recipe in ("align", "rerank") else [])]
     given = [each for each in options(recipe) if not each.startswith("scenes.")]
     assert_refused(run(recipe, *given, *scenes, *more, option.replace("=num_scene=3", '="num_scene=3"')), told)
     assert not (tmp_path / "c").exists()

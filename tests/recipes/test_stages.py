@@ -49,9 +49,9 @@ from recipes.common.cli import CONFIG, plain
 from recipes.common.kinds import taken_by
 from recipes.common.models import episode_options, open_policy
 from recipes.common.partial import PartialResult
-from recipes.common.rolled import Rolled
+from recipes.common.rolled import Rolled, final_spread
 from recipes.common.scenes import open_splits
-from recipes.evaluate import FIGURES, final_spread, standing_moved
+from recipes.evaluate import FIGURES, standing_moved
 from recipes.experiment.jobs import align_job
 from recipes.experiment.pool import Job, Workers
 from recipes.ladder import SIMULATOR

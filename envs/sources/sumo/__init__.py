@@ -48,13 +48,13 @@ __all__ = [
     "SPLITS",
     "SUMO",
     "SumoUnit",
-    "exits_by_lane",
     "generate",
     "make_options",
     "parse",
     "prepared",
     "read_unit",
     "recorded",
+    "rules_of",
     "simulate",
     "units",
 ]
@@ -206,10 +206,9 @@ def simulate(unit: SumoUnit) -> list[Scene]:
     )
 
 
-def exits_by_lane(unit: SumoUnit) -> bool:
-    """In a simulation's random traffic, a way out is as likely as it has lanes."""
-    rules = settings()["presets"][unit.preset] if unit.preset else settings()["own_network"]
-    return rules["traffic"].get("inflow_per", "street") == "lane"
+def rules_of(unit: SumoUnit) -> dict[str, dict]:
+    """Rules of a simulation's network and of its random traffic, from ``sumo.yaml``."""
+    return settings()["presets"][unit.preset] if unit.preset else settings()["own_network"]
 
 
 def prepared(unit: SumoUnit, folder: Path) -> tuple[NetMap, Run]:
@@ -225,9 +224,9 @@ def prepared(unit: SumoUnit, folder: Path) -> tuple[NetMap, Run]:
     """
     if unit.net:
         return _own(unit, folder)
-    preset = settings()["presets"][unit.preset]
-    network = make_network(folder, preset["network"], preset["signalled"], unit.number)
-    return build_map(network, unit.options.point_spacing), _random_run(unit, network, preset, folder)
+    rules = rules_of(unit)
+    network = make_network(folder, rules["network"], rules["signalled"], unit.number)
+    return build_map(network, unit.options.point_spacing), _random_run(unit, network, folder)
 
 
 def recorded(unit: SumoUnit, run: Run, folder: Path) -> Recording:
@@ -251,9 +250,9 @@ def recorded(unit: SumoUnit, run: Run, folder: Path) -> Recording:
         raise SceneError(f"{files}: SUMO cannot simulate it; correct what it says: {error}") from error
 
 
-def _random_run(unit: SumoUnit, network: Network, rules: dict[str, dict], folder: Path) -> Run:
+def _random_run(unit: SumoUnit, network: Network, folder: Path) -> Run:
     """Random traffic on any network."""
-    options = unit.options
+    options, rules = unit.options, rules_of(unit)
     rng = np.random.default_rng((unit.number, 1))  # a stream of its own: the network has (number)
     types = draw_types(rules.get("road_users", {}), options.imperfection, rng)
     traffic = draw_options(traffic_rules(rules["traffic"], options), rng)
@@ -267,7 +266,7 @@ def _own(unit: SumoUnit, folder: Path) -> tuple[NetMap, Run]:
     """The user's own network, with random traffic or the user's own."""
     network, road = own_network(Path(unit.net), unit.options.point_spacing)
     if not unit.routes:
-        return road, _random_run(unit, network, settings()["own_network"], folder)
+        return road, _random_run(unit, network, folder)
     routes, options = read_routes(Path(unit.routes)), unit.options
     duration = options.windows * options.window_spacing
     begin = routes.stretch(unit.number, duration)

@@ -109,6 +109,20 @@ def write_demand(
     path.write_text("\n".join(["<routes>", *kinds, *told, "</routes>"]), encoding="utf-8")
 
 
+def exits_by_lane(traffic: dict[str, object]) -> bool:
+    """A way out is as likely as it has lanes.
+
+    Args:
+        traffic: of a preset in ``sumo.yaml``.
+
+    Examples:
+        >>> presets = settings()["presets"]
+        >>> [exits_by_lane(presets[name]["traffic"]) for name in ("motorway", "grid")]
+        [True, False]
+    """
+    return traffic.get("inflow_per", "street") == "lane"
+
+
 def targets_of(network: Network, source: str, by_lane: bool) -> list[str]:
     """Where a trip may end, each as likely as the others.
 
@@ -132,7 +146,7 @@ class _Demand:
             raise SceneError(f"{network.path}: no street where cars may drive; give a network with roads.")
         self.entries = [e for e in self.roads if e.start in network.dead_ends] or self.roads[::SOURCE_SHARE]
         self.inner = [e for e in self.roads if e.start not in network.dead_ends] or self.roads
-        self.by_lane = traffic.get("inflow_per", "street") == "lane"
+        self.by_lane = exits_by_lane(traffic)
         self.counts = {
             user: sum(name.rstrip("0123456789") == user for name in types) for user in settings()["road_users"]
         }

@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from envs.scene import CURRENT_STEP, LOG_STEPS, STEP_SECONDS, Scene
-from envs.sources.sumo import SumoUnit, exits_by_lane, prepared, read_unit, recorded
+from envs.sources.sumo import SumoUnit, prepared, read_unit, recorded, rules_of
+from envs.sources.sumo.demand import exits_by_lane
 from envs.sources.sumo.tracks import KERNEL_REACH, Tracks, make_tracks
 from envs.sources.sumo.traffic import Recording, Run
 from envs.sources.sumo.ways import draw_ways, possible_ways
@@ -86,7 +87,8 @@ def futures(origin: str, scene: Scene, seeds: Sequence[int], *, keeps: Keeps = "
         possible = {}
         if keeps == "drivers":
             names = {log.names[row] for row in rows}
-            possible = possible_ways(state, names, run.network, run.routes, exits_by_lane(unit), folder)
+            by_lane = exits_by_lane(rules_of(unit)["traffic"])
+            possible = possible_ways(state, names, run.network, run.routes, by_lane, folder)
         ahead = []
         for seed in seeds:
             draw_ways(state, possible, np.random.default_rng(seed))
@@ -110,8 +112,7 @@ def _saved(
 
 def _resumed(run: Run, now: int, state: Path) -> Run:
     """The simulation from a step of its recording on."""
-    recorded_from = round((run.begin + run.warmup) / STEP_SECONDS)  # as in `simulate_traffic`
-    steps = recorded_from + now - round(run.begin / STEP_SECONDS)
+    steps = run.first_step + now - round(run.begin / STEP_SECONDS)
     begin = round(run.begin + steps * STEP_SECONDS, 3)
     duration = (1 + FUTURE_STEPS + SPARE_STEPS) * STEP_SECONDS
     return replace(run, begin=begin, warmup=0.0, duration=duration, options=run.options | {"load-state": state})

@@ -62,6 +62,11 @@ class Run:
     duration: float
     options: dict[str, object] = field(default_factory=dict)
 
+    @property
+    def first_step(self) -> int:
+        """Step of the simulation that the recording begins with."""
+        return round((self.begin + self.warmup) / STEP_SECONDS)
+
 
 def simulate_traffic(run: Run, folder: Path) -> Recording:
     """Simulate, and read what happened after the warm-up.
@@ -78,7 +83,7 @@ def simulate_traffic(run: Run, folder: Path) -> Recording:
     events = [f'<timedEvent type="SaveTLSStates" source="{light}" dest="lights.xml"/>' for light in lights]
     (folder / "events.add.xml").write_text("\n".join(["<additional>", *events, "</additional>"]), encoding="utf-8")
     _simulate(run, folder)
-    first, steps = (round(time / STEP_SECONDS) for time in (run.begin + run.warmup, run.duration))
+    first, steps = run.first_step, round(run.duration / STEP_SECONDS)
     names, types, values = _read_tracks(folder / "tracks.csv", first, steps)
     unknown = sorted(set(types) - set(run.bodies))
     if unknown:

@@ -61,11 +61,12 @@ def possible_ways(
     Returns:
         For each driver its possible ways, the probabilities of which sum to 1; drivers without a trip are left out.
     """
-    trips = {trip.get("id"): trip for trip in read_xml(demand, "random traffic").iter("trip")}
+    traffic = read_xml(demand, "random traffic")
+    trips = {trip.get("id"): trip for trip in traffic.iter("trip")}
     drivers = [driver for driver in _drivers(state) if driver.name in trips and driver.name in names]
     ends = {each.name: Counter(targets_of(network, trips[each.name].get("from"), by_lane)) for each in drivers}
     fastest = _fastest(
-        demand, [(trips[each.name], end) for each in drivers for end in ends[each.name]], network, folder
+        traffic, [(trips[each.name], end) for each in drivers for end in ends[each.name]], network, folder
     )
     leads = {(each.source, network.lanes[each.target].edge_id) for each in network.connections}
     possible = {}
@@ -125,11 +126,11 @@ def can_take(driver: Driver, way: Way, leads: Collection[tuple[str, str]]) -> bo
 
 
 def _fastest(
-    demand: Path, wanted: list[tuple[ElementTree.Element, str]], network: Network, folder: Path
+    traffic: ElementTree.Element, wanted: list[tuple[ElementTree.Element, str]], network: Network, folder: Path
 ) -> dict[tuple[str, str], Way]:
     """Fastest ways of trips to other ends, by trip and end, as SUMO finds them; some may have none."""
     root = ElementTree.Element("routes")
-    root.extend(read_xml(demand, "random traffic").iter("vType"))
+    root.extend(traffic.iter("vType"))
     for number, (trip, end) in enumerate(wanted):
         told = {"id": str(number), "type": trip.get("type"), "depart": "0", "from": trip.get("from"), "to": end}
         ElementTree.SubElement(root, "trip", told)
