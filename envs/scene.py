@@ -150,6 +150,11 @@ class Agents(TensorClass["nocast"]):
         """``[*, A, L, 3]``: x, y, heading of every logged step; 0 where invalid."""
         return torch.cat((self.position[..., :2], self.heading[..., None]), -1)
 
+    @property
+    def trajectory(self) -> Tensor:
+        """``[*, A, L, 4]``: x, y, z, heading of every logged step, as those of rollouts; 0 where invalid."""
+        return torch.cat((self.position, self.heading[..., None]), -1)
+
     def recent(self, steps: int) -> Tensor:
         """Poses of the last logged steps up to the current one, without holes.
 

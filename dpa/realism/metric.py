@@ -124,7 +124,7 @@ def realism(
     Examples:
         >>> from envs.sources.synthetic import straight_road
         >>> scene = straight_road(num_vehicles=3, seed=0)
-        >>> log = torch.cat((scene.agents.position, scene.agents.heading[..., None]), -1)[None, :, 11:]
+        >>> log = scene.agents.trajectory[None, :, 11:]
         >>> result = realism(scene, log.expand(32, -1, -1, -1))
         >>> result.min_ade, result.collision_rate
         (0.0, 0.0)
@@ -235,7 +235,7 @@ def contributions(measured: Features, config: RealismConfig) -> Tensor:
         >>> from dpa.realism import compare, measure
         >>> from envs.sources.synthetic import straight_road
         >>> scene, config = straight_road(num_vehicles=2), RealismConfig.load("2024")
-        >>> log = torch.cat((scene.agents.position, scene.agents.heading[..., None]), -1)[None, :, 11:]
+        >>> log = scene.agents.trajectory[None, :, 11:]
         >>> (measured,) = measure([compare(scene, torch.cat((log, log, log + 50.0)), config)], config)
         >>> contributions(measured, config).sum(1).sign()
         tensor([ 1.,  1., -1.])

@@ -17,8 +17,9 @@ from rich.console import Console
 from torch import Tensor
 
 from dpa.safety.measure import MEASURES, safety
-from dpa.safety.motion import NOW, logged
-from dpa.safety.off_road import off_road
+from dpa.safety.motion import NOW
+from envs.devices import of_rows
+from envs.geometry.edges import RoadEdges
 from envs.progress import progress
 from envs.scene import EDGE_KINDS, AgentKind, Scene, polylines
 from envs.store import SceneStore
@@ -35,8 +36,10 @@ def make_parser() -> argparse.ArgumentParser:
 def leaves_road(scene: Scene) -> Tensor:
     """``[A]`` bool: an agent of an uncollated scene is off the road at some step of its log after the current one."""
     agents = scene.agents
-    poses = torch.cat((agents.position, agents.heading[..., None]), -1)[:, NOW + 1 :]
-    return off_road(polylines(scene, EDGE_KINDS), poses, agents.extent, agents.valid[:, NOW + 1 :]).any(-1)
+    poses, there = agents.trajectory[:, NOW + 1 :], agents.valid[:, NOW + 1 :]
+    size = agents.extent[:, None].expand(*there.shape, 3)
+    edges = RoadEdges.from_polylines(polylines(scene, EDGE_KINDS))
+    return (of_rows(there, edges.box_offroad_distance, poses[..., :3], poses[..., 3], size) > 0).any(-1)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -51,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for index in progress(range(min(len(scenes), options.limit or len(scenes))), "measure", unit="scene"):
         scene = scenes[index]
         agents, present = scene.agents, scene.agents.present
-        log = logged(scene)[None, :, NOW + 1 :]
+        log = agents.trajectory[None, present, NOW + 1 :]
         for name, value in safety(scene, log, present[present]).items():
             if value is not None:
                 values[name].append(value)

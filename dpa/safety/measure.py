@@ -47,7 +47,7 @@ def safety(scene: Scene, trajectories: Tensor, controlled: Tensor) -> dict[str, 
         >>> import torch
         >>> from envs.sources.synthetic import red_light
         >>> scene = red_light(speed=8.0)
-        >>> log = torch.cat((scene.agents.position, scene.agents.heading[..., None]), -1)[None, :, 11:]
+        >>> log = scene.agents.trajectory[None, :, 11:]
         >>> safety(scene, log, torch.tensor([True]))
         {'wrong_way': 0.0, 'red_light': 1.0, 'close_pass': 0.0, 'harsh_jerk': 0.0}
     """

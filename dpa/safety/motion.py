@@ -63,14 +63,16 @@ class Motion:
                 f"scene {scene.scene_id} has {num} present agents, so controlled is [{num}] bool, got "
                 f"{list(controlled.shape)} {controlled.dtype}."
             )
-        history = logged(scene)[None, :, : NOW + 1].to(trajectories).expand(len(trajectories), -1, -1, -1)
+        history = agents.trajectory[present][None, :, : NOW + 1].to(trajectories).expand(len(trajectories), -1, -1, -1)
         valid = agents.valid[present][:, : NOW + 1 + steps]
         return cls(scene, torch.cat((history, trajectories), 2), valid, controlled)
 
     @property
     def log(self) -> Motion:
         """The log over the same steps, as the one future (K = 1)."""
-        return Motion(self.scene, logged(self.scene)[None, :, : self.valid.shape[1]], self.valid, self.controlled)
+        agents = self.scene.agents
+        poses = agents.trajectory[agents.present, : self.valid.shape[1]]
+        return Motion(self.scene, poses[None], self.valid, self.controlled)
 
     @cached_property
     def extent(self) -> Tensor:
@@ -86,12 +88,6 @@ class Motion:
     def driver(self) -> Tensor:
         """``[A]`` bool: a vehicle that the policy moves."""
         return self.controlled & self.vehicle
-
-
-def logged(scene: Scene) -> Tensor:
-    """Poses of the present agents at all logged steps: ``[A, L, 4]`` x, y, z, heading."""
-    agents, present = scene.agents, scene.agents.present
-    return torch.cat((agents.position, agents.heading[..., None]), -1)[present]
 
 
 def lasts(flag: Tensor, steps: int) -> Tensor:

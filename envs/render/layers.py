@@ -87,7 +87,7 @@ def pose_tracks(scene: Scene, trajectories: Tensor | None = None) -> Tensor:
         tensor([-1.,  0.,  0.])
     """
     agents = scene.agents
-    poses = torch.cat((agents.position[..., :2], agents.heading[..., None]), -1)
+    poses = agents.poses
     poses = torch.where(agents.valid[..., None], poses, torch.nan)
     if trajectories is None:
         return poses

@@ -78,7 +78,7 @@ def crowded_scene(agents: int, segments: int, seed: int = 0) -> Scene:
 def noisy_log(scene: Scene, num_rollouts: int, seed: int = 0) -> Tensor:
     """``[R, A, 80, 4]``: the log with a drift of some metres, as rollouts."""
     agents = scene.agents
-    log = torch.cat((agents.position, agents.heading[..., None]), -1)[None, agents.present, CURRENT_STEP + 1 :]
+    log = agents.trajectory[None, agents.present, CURRENT_STEP + 1 :]
     noise = torch.randn(num_rollouts, *log.shape[1:], generator=torch.Generator().manual_seed(seed))
     return log + noise.cumsum(2) * torch.tensor([0.05, 0.05, 0.0, 0.005])
 

@@ -129,7 +129,7 @@ def _seen(scene: Scene, steps: int) -> tuple[Tensor, Tensor]:
 def _log(scene: Scene) -> Tensor:
     """``[A, 80, 4]`` of the present agents; a step that the log lacks has the pose of the last one that it has."""
     agents = scene.agents
-    poses = torch.cat((agents.position, agents.heading[..., None]), -1)[agents.present, CURRENT_STEP:]
+    poses = agents.trajectory[agents.present, CURRENT_STEP:]
     steps = torch.arange(poses.shape[1])
     last = torch.where(agents.valid[agents.present, CURRENT_STEP:], steps, 0).cummax(1).values
     return poses.gather(1, last[..., None].expand_as(poses))[:, 1:]

@@ -723,7 +723,7 @@ def test_a_seed_makes_a_future_and_another_one_another(resumed: tuple) -> None:
 def test_a_future_begins_where_the_scene_is_and_moves_as_its_log_does(resumed: tuple) -> None:
     unit, scene = resumed
     agents, some = scene.agents, futures(unit.text, scene, [1, 2])
-    now = torch.cat((agents.position[..., :2], agents.heading[..., None]), -1)[agents.present, CURRENT_STEP]
+    now = agents.poses[agents.present, CURRENT_STEP]
     path = torch.cat((now.expand(2, -1, -1)[:, :, None], some), 2)
     speed = path[..., :2].diff(dim=2).norm(dim=-1) / STEP_SECONDS
     on_foot = agents.kind[agents.present] == AgentKind.PEDESTRIAN

@@ -45,7 +45,7 @@ class Stops(MotionLM):
 def logged(scene: Scene) -> Tensor:
     """``[A, 80, 4]``."""
     agents = scene.agents
-    return torch.cat((agents.position, agents.heading[..., None]), -1)[:, CURRENT_STEP + 1 :]
+    return agents.trajectory[:, CURRENT_STEP + 1 :]
 
 
 def two_cars() -> Scene:

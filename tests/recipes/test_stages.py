@@ -1014,7 +1014,7 @@ def test_standing_agents_that_rollouts_move_are_counted() -> None:
     standing, driving = straight_road(2, speed=0.0), straight_road(2, speed=10.0)
     scene = standing.clone()
     scene.agents.position[1] = driving.agents.position[1]
-    future = torch.cat((scene.agents.position, scene.agents.heading[..., None]), -1)[:, CURRENT_STEP + 1 :]
+    future = scene.agents.trajectory[:, CURRENT_STEP + 1 :]
     trajectories = future.repeat(4, 1, 1, 1)
     assert standing_moved(scene, trajectories) == 0
     trajectories[:, 1, :, 0] += 50.0  # it drives in the log: no sign of anything

@@ -92,7 +92,7 @@ def feature_clips(
 
 def log_trajectory(scene: Scene, steps: int) -> Tensor:
     """The log as a trajectory: ``[A, T, 4]`` x, y, z, heading of the present agents after the current step."""
-    return _poses(scene)[:, CURRENT_STEP + 1 : CURRENT_STEP + 1 + steps]
+    return scene.agents.trajectory[scene.agents.present, CURRENT_STEP + 1 : CURRENT_STEP + 1 + steps]
 
 
 def occupancy_features(
@@ -185,7 +185,9 @@ def _motion(scene: Scene, trajectories: Tensor, ego: Tensor | None, stride: int)
     if not 1 <= stride <= steps:
         raise ValueError(f"stride must be 1 to {steps} (the number of steps), got {stride}.")
     history, device = slice(CURRENT_STEP + 1 - CONTEXT, CURRENT_STEP + 1), trajectories.device
-    before = _poses(scene)[:, history].to(trajectories).expand(len(trajectories), -1, -1, -1)
+    before = (
+        scene.agents.trajectory[scene.agents.present, history].to(trajectories).expand(len(trajectories), -1, -1, -1)
+    )
     return Motion(
         scene=scene,
         poses=torch.cat((before, trajectories), 2),
@@ -194,12 +196,6 @@ def _motion(scene: Scene, trajectories: Tensor, ego: Tensor | None, stride: int)
         ego=torch.arange(trajectories.shape[1], device=device) if ego is None else ego.to(device),
         steps=torch.arange(stride - 1, steps, stride, device=device) + CONTEXT,
     )
-
-
-def _poses(scene: Scene) -> Tensor:
-    """``[A, L, 4]`` x, y, z, heading of the present agents."""
-    agents, present = scene.agents, scene.agents.present
-    return torch.cat((agents.position[present], agents.heading[present][..., None]), -1)
 
 
 def _only_among(names: Sequence[str], given: Mapping | None, what: str) -> dict:

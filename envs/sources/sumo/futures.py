@@ -154,7 +154,7 @@ def _rows(scene: Scene, tracks: Tracks, now: int, origin: str) -> np.ndarray:
 def _present_poses(scene: Scene) -> np.ndarray:
     """``[A, 3]`` at the current step."""
     agents = scene.agents
-    poses = torch.cat((agents.position[..., :2], agents.heading[..., None]), -1)
+    poses = agents.poses
     return poses[agents.present, CURRENT_STEP].numpy().astype(np.float64)
 
 

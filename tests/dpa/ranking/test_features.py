@@ -98,7 +98,7 @@ def test_a_neighbour_missing_in_the_log_is_missing_for_rollouts_too() -> None:
     scene.agents.valid[1, CURRENT_STEP + 1 :] = False
     log = log_trajectory(scene, 80)
     rollout = two_cars_head_on().agents
-    rollout = torch.cat((rollout.position, rollout.heading[..., None]), -1)[:, CURRENT_STEP + 1 :]
+    rollout = rollout.trajectory[:, CURRENT_STEP + 1 :]
     phi, valid = occupancy_features(scene, torch.stack((rollout, log)), ["collision", "clearance"])
     assert torch.equal(phi[0], phi[1])
     assert valid.tolist() == [[True] * 80, [False] * 80]

@@ -24,7 +24,7 @@ def far_road(number: int, vehicles: int = 2) -> Scene:
 
 def noisy_rollouts(scene: Scene, rollouts: int = 32) -> Tensor:
     agents = scene.agents
-    log = torch.cat((agents.position, agents.heading[..., None]), -1)[agents.present, CURRENT_STEP + 1 :]
+    log = agents.trajectory[agents.present, CURRENT_STEP + 1 :]
     noise = torch.randn(rollouts, *log.shape, generator=torch.Generator().manual_seed(len(log)))
     return log + 0.1 * noise
 

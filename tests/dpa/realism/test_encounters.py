@@ -35,7 +35,7 @@ def parked(*places: tuple[float, float]) -> Scene:
 def logged(scene: Scene) -> Tensor:
     """``[1, A, 80, 4]``."""
     agents = scene.agents
-    return torch.cat((agents.position, agents.heading[..., None]), -1)[None, :, CURRENT_STEP + 1 :].clone()
+    return agents.trajectory[None, :, CURRENT_STEP + 1 :].clone()
 
 
 @pytest.mark.parametrize(

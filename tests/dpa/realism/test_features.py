@@ -76,7 +76,7 @@ def test_measurements_equal_those_of_the_code_of_2023_on_a_real_scene(shared: Pa
 
 def log_as_rollout(scene: Scene) -> torch.Tensor:
     agents = scene.agents
-    return torch.cat((agents.position, agents.heading[..., None]), -1)[None, agents.present, 11:]
+    return agents.trajectory[None, agents.present, 11:]
 
 
 def test_differences_at_the_end_of_a_rollout_are_not_a_number() -> None:

@@ -19,7 +19,7 @@ def scene() -> Scene:
 
 def whole_log(scene: Scene, rollouts: int = 4) -> torch.Tensor:
     agents = scene.agents
-    poses = torch.cat((agents.position, agents.heading[..., None]), -1)[agents.present]
+    poses = agents.trajectory[agents.present]
     return poses.expand(rollouts, -1, -1, -1)
 
 

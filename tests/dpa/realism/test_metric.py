@@ -162,7 +162,7 @@ def test_moving_the_world_changes_nothing_but_rounding(shift: tuple[int, int], y
 
 def log_as_rollout(scene: Scene) -> torch.Tensor:
     agents = scene.agents
-    return torch.cat((agents.position, agents.heading[..., None]), -1)[None, agents.present, 11:]
+    return agents.trajectory[None, agents.present, 11:]
 
 
 @pytest.mark.parametrize("memory", [1.0, 1e-6])
@@ -214,7 +214,7 @@ def test_rates_of_classes_are_of_their_evaluated_agents_alone() -> None:
     scene.agents.kind[2] = AgentKind.PEDESTRIAN
     scene.agents.predict[:] = torch.tensor([True, True, True, True, False])
     agents = scene.agents
-    held = torch.cat((agents.position, agents.heading[..., None]), -1)[:, CURRENT_STEP, None].expand(-1, 80, -1)
+    held = agents.trajectory[:, CURRENT_STEP, None].expand(-1, 80, -1)
     rollouts = held.expand(4, -1, -1, -1).clone()
     rollouts[0, 2] = rollouts[0, 3]
     result = realism(scene, rollouts, config, features=True)

@@ -24,7 +24,7 @@ def without(quirk: Quirk) -> RealismConfig:
 
 def log_as_rollout(scene: Scene) -> torch.Tensor:
     agents = scene.agents
-    return torch.cat((agents.position, agents.heading[..., None]), -1)[None, agents.present, 11:]
+    return agents.trajectory[None, agents.present, 11:]
 
 
 def likelihood(scene: Scene, rollouts: torch.Tensor, config: RealismConfig, name: str) -> float:

@@ -69,7 +69,7 @@ def far_away() -> list[Scene]:
 
 def rollouts_of(scene: Scene) -> torch.Tensor:
     agents = scene.agents
-    log = torch.cat((agents.position, agents.heading[..., None]), -1)[None, agents.present, 11:]
+    log = agents.trajectory[None, agents.present, 11:]
     noise = torch.randn(32, *log.shape[1:], generator=torch.Generator().manual_seed(0))
     return log + noise.cumsum(2) * 0.01
 

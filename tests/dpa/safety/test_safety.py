@@ -29,7 +29,7 @@ EDGE = [(MapKind.EDGE_BOUNDARY, torch.tensor([[500.0, 50.0], [-500.0, 50.0]]))]
 def log_of(scene: Scene) -> Tensor:
     """The log as the one rollout: ``[1, A, 80, 4]``."""
     agents, present = scene.agents, scene.agents.present
-    return torch.cat((agents.position, agents.heading[..., None]), -1)[present][None, :, CURRENT_STEP + 1 :]
+    return agents.trajectory[present][None, :, CURRENT_STEP + 1 :]
 
 
 def measured(scene: Scene, trajectories: Tensor | None = None, controlled: Tensor | None = None) -> dict:
