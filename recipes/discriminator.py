@@ -31,10 +31,10 @@ from envs.store import SceneStore
 from recipes.common.cli import CONFIG, build, finished, finite, plain, recipe
 from recipes.common.models import given_policies, open_policy, weights_digest
 from recipes.common.rankings import build_distance
-from recipes.common.rolled import Rolled, driven
+from recipes.common.rolled import Rolled, driven, driven_log
 from recipes.common.scenes import fingerprint, open_splits
 from recipes.studies.adversary import best_look, fit
-from recipes.studies.motions import MotionShelf, Sight, driven_log
+from recipes.studies.motions import MotionShelf, Sight
 from recipes.studies.spurious import QUANTITIES, RANKINGS, summarise
 from recipes.studies.study import (
     RANDOM_GROUPS,
@@ -98,7 +98,7 @@ def trained(cfg: DictConfig, scenes: SceneStore, policy: Path, name: str) -> tup
 
 def seen(each: Rolled, sight: Sight, tokenizer: MotionTokenizer, options: EpisodeOptions) -> tuple[Any, Tensor]:
     """The motions of a scene's log and rollouts, and the log ``[A, 80, 4]`` that they were compared with."""
-    log = driven_log(each.scene, tokenizer, options, tokenized=sight.tokenized)
+    log = driven_log(each.scene, tokenizer if sight.tokenized else None, options)
     return sight(each, log), log
 
 

@@ -20,7 +20,8 @@ from torch import Tensor
 from dpa.ranking import FEATURES, PreferenceDistance, transport_cost
 from dpa.ranking.features import feature_names
 from dpa.report.canvas import INK, QUIET, RULE, blank_figure, calm, save_figure
-from envs.render import View, box_corners, draw_map, frame_view, pose_tracks
+from envs.geometry.boxes import box_corners
+from envs.render import View, draw_map, frame_view, pose_tracks
 from envs.scene import CURRENT_STEP, STEP_SECONDS, AgentKind, Scene
 
 ROLLOUT_COLOR, LOG_COLOR, OTHERS_COLOR = "#d55e00", "#2a2d30", "#9aa0a6"
@@ -189,7 +190,8 @@ def _draw_track(axes: Axes, poses: Tensor, extent: Tensor, color: str, zorder: f
         axes.add_collection(
             LineCollection(pieces[drawn], colors=colors, linewidths=width, zorder=zorder, capstyle="round")
         )
-    box = box_corners(poses[seen][-1:], extent).numpy()
+    last = poses[seen][-1:]
+    box = box_corners(torch.cat((last, extent[:2].expand(len(last), 2)), -1)).numpy()
     axes.add_collection(PolyCollection(box, facecolors="none", edgecolors=color, linewidths=1.5, zorder=zorder + 2))
 
 
@@ -197,7 +199,7 @@ def _draw_others(axes: Axes, poses: Tensor, extent: Tensor) -> None:
     """Boxes now and paths of agents ``[n, T + 1, 3]``, without the colours of classes: hues tell log from rollout."""
     axes.add_collection(LineCollection(poses[..., :2].numpy(), colors=OTHERS_COLOR, linewidths=0.8, zorder=7))
     there = torch.isfinite(poses[:, 0]).all(-1)
-    boxes = box_corners(poses[there, 0], extent[there]).numpy()
+    boxes = box_corners(torch.cat((poses[there, 0], extent[there, :2]), -1)).numpy()
     axes.add_collection(PolyCollection(boxes, facecolors=OTHERS_COLOR, edgecolors="white", linewidths=0.4, zorder=9))
 
 

@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dpa.losses.saturation import WATCHED, SaturationWatch
 from dpa.report.experiment import Decoding, Experiment, decoding_of, in_words, read_json
 from dpa.report.statistics import SCENES, verdict
 from dpa.report.table import REFERENCE, signed
-from dpa.training.loggers import read_curves
 
 FEW_SEEDS = 5
 """With fewer training runs a bootstrap interval is too narrow; see :func:`dpa.report.statistics.paired_bootstrap`."""
@@ -133,15 +131,15 @@ def budgets(experiment: Experiment) -> str | None:
 def saturated(experiment: Experiment, folder: Path) -> str | None:
     """Which methods trained with a loss that no longer weighed preferences; None where no run says so.
 
-    The curves are watched anew, so that runs of code that did not warn yet are told of as well.
-
     Args:
-        experiment: whose runs are asked; a run without a ``result.json`` in the folder says nothing.
+        experiment: whose runs are asked for the warning that ``recipes.align`` keeps in ``result.json``; a run without
+            that file says nothing.
         folder: of the study.
     """
     told = []
     for method, runs in experiment.curves.items():
-        warned = sum(_has_saturated(folder / run) for run in runs.values() if (folder / run / "result.json").is_file())
+        results = (folder / run / "result.json" for run in runs.values())
+        warned = sum("saturated" in read_json(result) for result in results if result.is_file())
         if warned:
             told.append(f"{experiment.labels[method]} ({warned} of {len(runs)} seeds)")
     if not told:
@@ -150,19 +148,6 @@ def saturated(experiment: Experiment, folder: Path) -> str | None:
         f"Saturated: {', '.join(told)}. The weights of their pairs say little about how clear a preference is; the "
         "warning that `recipes.align` gives says why, and what to change."
     )
-
-
-def _has_saturated(run: Path) -> bool:
-    """Whether the loss of a finished run saturated: by its curves; by the warning in its result where it lacks them."""
-    result = read_json(run / "result.json")
-    loss = result.get("options", {}).get("loss")
-    curves = read_curves(run)
-    if loss is None or any(f"train/{name}" not in curves for name in WATCHED):
-        return "saturated" in result
-    watch, seen = SaturationWatch(loss), [curves[f"train/{name}"] for name in WATCHED]
-    for rows in zip(*seen, strict=True):
-        watch(rows[0][0] - 1, {name: value for name, (_, value) in zip(WATCHED, rows, strict=True)})
-    return watch.found is not None
 
 
 def ordering(experiment: Experiment) -> str:

@@ -8,13 +8,12 @@ only what moves. From a shell::
     python -m envs.render STORE --scene 0 --out scene.mp4
 """
 
-from envs.render.layers import View, box_corners, draw_agents, draw_map, draw_trails, fit_view, frame_view, pose_tracks
+from envs.render.layers import View, draw_agents, draw_map, draw_trails, fit_view, frame_view, pose_tracks
 from envs.render.picture import frames_over, render_frame, render_frames
 from envs.render.save import check_writable, save_picture
 
 __all__ = [
     "View",
-    "box_corners",
     "check_writable",
     "draw_agents",
     "draw_map",

@@ -13,7 +13,7 @@ from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
 from torch import Tensor
 
-from envs.geometry.frames import rotate
+from envs.geometry.boxes import box_corners
 from envs.render import style
 from envs.scene import CURRENT_STEP, LOG_STEPS, Scene, polylines
 
@@ -105,24 +105,6 @@ def pose_tracks(scene: Scene, trajectories: Tensor | None = None) -> Tensor:
     return poses
 
 
-def box_corners(pose: Tensor, extent: Tensor) -> Tensor:
-    """Corners of boxes, counter-clockwise from the front left.
-
-    Args:
-        pose: ``[..., 3]`` x, y, heading.
-        extent: ``[..., >=2]`` length, width [m].
-
-    Returns:
-        ``[..., 4, 2]`` [m].
-
-    Examples:
-        >>> box_corners(torch.tensor([1.0, 0.0, 0.0]), torch.tensor([4.0, 2.0]))[0]
-        tensor([3., 1.])
-    """
-    signs = torch.tensor([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
-    return rotate(signs * extent[..., None, :2] / 2, pose[..., None, 2]) + pose[..., None, :2]
-
-
 def draw_map(axes: Axes, scene: Scene) -> None:
     """Draw the map of one uncollated scene: road surface, areas, lines, edges and stop signs."""
     axes.set_facecolor(style.GROUND_COLOR)
@@ -184,7 +166,7 @@ def draw_agents(axes: Axes, scene: Scene, tracks: Tensor, step: int) -> list[Art
     """
     there = torch.isfinite(tracks[:, step]).all(-1)
     pose, extent = tracks[there, step], scene.agents.extent[there]
-    corners = box_corners(pose, extent)
+    corners = box_corners(torch.cat((pose, extent[:, :2]), -1))
     front = (corners[:, 0] + corners[:, 3]) / 2
     # A third of the way back on both sides: with the middle of the front it makes an arrow head.
     left, right = torch.lerp(corners[:, 0], corners[:, 1], 0.33), torch.lerp(corners[:, 3], corners[:, 2], 0.33)

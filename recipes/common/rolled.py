@@ -84,6 +84,33 @@ def waiting(scenes: SceneSource, done: Collection[int]) -> Iterator[tuple[int, S
     return ((index, scenes[index]) for index in range(len(scenes)) if index not in done)
 
 
+def driven_log(scene: Scene, tokenizer: MotionTokenizer | None, options: EpisodeOptions) -> Tensor:
+    """The log as a policy would have driven it: by tokens, at the height of the road; others replay as in a rollout.
+
+    Args:
+        scene: uncollated.
+        tokenizer: of the policy; None: controlled agents keep their logged poses.
+        options: of the episode; they say whom the policy moves.
+
+    Returns:
+        ``[A, 80, 4]`` x, y, z, heading of the present agents; past the first hole of a log it means nothing.
+
+    Examples:
+        >>> from dpa.tokens import VerletTokenizer
+        >>> from envs.sources.synthetic import straight_road
+        >>> scene = straight_road(2, seed=0)
+        >>> sides = [driven_log(scene, tokenizer, EpisodeOptions()) for tokenizer in (VerletTokenizer(), None)]
+        >>> 0 < (sides[0] - sides[1]).abs().max() < 0.3
+        tensor(True)
+    """
+    episode = make_episode(scene, options)
+    poses = episode.logged
+    if tokenizer is not None:
+        tracks = tokenizer.encode_tracks(poses, episode.logged_valid, episode.recent, episode.kind)
+        poses = torch.where(episode.controlled[:, None, None], tracks.poses, poses)
+    return lifted(scene, poses[None])[0]
+
+
 def logs(
     scenes: SceneSource, options: EpisodeOptions, tokenizer: MotionTokenizer | None, done: Collection[int] = ()
 ) -> Iterator[Rolled]:
@@ -96,12 +123,7 @@ def logs(
         done: scenes to leave out.
     """
     for index, scene in waiting(scenes, done):
-        episode = make_episode(scene, replace(options, control="sdc"))
-        poses = episode.logged
-        if tokenizer is not None:
-            tracks = tokenizer.encode_tracks(poses, episode.logged_valid, episode.recent, episode.kind)
-            poses = torch.where(episode.controlled[:, None, None], tracks.poses, poses)
-        yield Rolled.of(index, scene, lifted(scene, poses[None]))
+        yield Rolled.of(index, scene, driven_log(scene, tokenizer, replace(options, control="sdc"))[None])
 
 
 def driven(

@@ -14,12 +14,9 @@ from torch import Tensor
 
 from dpa.discriminator import ROAD, observed_motion, width_of
 from dpa.ranking.features import feature_names
-from dpa.rollout import lifted
-from dpa.tokens import MotionTokenizer
-from envs.episode import EpisodeOptions, make_episode
 from envs.files import PARTIAL_PREFIX, read_arrays, whole, write_json
 from envs.options import differences
-from envs.scene import CURRENT_STEP, Scene
+from envs.scene import CURRENT_STEP
 from recipes.common.rolled import Rolled
 
 
@@ -75,34 +72,6 @@ class Sight:
         both = torch.cat((log[None].to(each.trajectories), each.trajectories))
         values, valid = observed_motion(each.scene, both, ego=ego, stride=self.stride, road=self.road)
         return Motions(values[:1], values[1:], valid)
-
-
-def driven_log(scene: Scene, tokenizer: MotionTokenizer, options: EpisodeOptions, *, tokenized: bool) -> Tensor:
-    """The log as a policy would have driven it: by tokens, at the height of the road; others replay as in a rollout.
-
-    Args:
-        scene: uncollated.
-        tokenizer: of the policy.
-        options: of the episode; they say whom the policy moves.
-        tokenized: otherwise controlled agents keep their logged poses.
-
-    Returns:
-        ``[A, 80, 4]`` x, y, z, heading of the present agents; past the first hole of a log it means nothing.
-
-    Examples:
-        >>> from dpa.tokens import VerletTokenizer
-        >>> from envs.sources.synthetic import straight_road
-        >>> scene, tokenizer = straight_road(2, seed=0), VerletTokenizer()
-        >>> sides = [driven_log(scene, tokenizer, EpisodeOptions(), tokenized=side) for side in (True, False)]
-        >>> 0 < (sides[0] - sides[1]).abs().max() < 0.3
-        tensor(True)
-    """
-    episode = make_episode(scene, options)
-    poses = episode.logged
-    if tokenized:
-        tracks = tokenizer.encode_tracks(poses, episode.logged_valid, episode.recent, episode.kind)
-        poses = torch.where(episode.controlled[:, None, None], tracks.poses, poses)
-    return lifted(scene, poses[None])[0]
 
 
 class MotionShelf:

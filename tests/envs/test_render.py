@@ -9,13 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 from PIL import Image
 
-from envs.render import View, box_corners, fit_view, pose_tracks, render_frame, render_frames, save_picture, style
+from envs.render import View, fit_view, pose_tracks, render_frame, render_frames, save_picture, style
 from envs.render import __main__ as command_line
 from envs.render.picture import legend_handles
 from envs.scene import CURRENT_STEP, LOG_STEPS, AgentKind, Scene
@@ -66,18 +64,6 @@ def test_a_shorter_rollout_leaves_the_rest_absent() -> None:
 def test_rollouts_that_do_not_fit_are_refused_with_their_shape(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"A'=2.*" + str(list(shape))[1:-1]):
         pose_tracks(straight_road(num_vehicles=2), torch.zeros(shape))
-
-
-@settings(max_examples=20, deadline=None)
-@given(x=st.floats(-50, 50), y=st.floats(-50, 50), heading=st.floats(-4, 4), length=st.floats(0.5, 20))
-def test_a_box_has_its_size_its_centre_and_turns_left(x: float, y: float, heading: float, length: float) -> None:
-    corners = box_corners(torch.tensor([x, y, heading]), torch.tensor([length, 1.5, 9.0])).double()
-    torch.testing.assert_close(corners.mean(0), torch.tensor([x, y], dtype=torch.float64), atol=1e-4, rtol=0)
-    nxt = corners.roll(-1, 0)
-    area = ((corners[:, 0] * nxt[:, 1] - corners[:, 1] * nxt[:, 0]).sum() / 2).item()
-    assert area == pytest.approx(1.5 * length, abs=0.02)
-    front = (corners[0] + corners[3]) / 2 - corners.mean(0)
-    assert (front @ torch.tensor([np.cos(heading), np.sin(heading)])).item() == pytest.approx(length / 2, abs=1e-4)
 
 
 def test_the_view_holds_the_evaluated_paths_and_centres_on_the_sdc_if_they_are_too_long() -> None:

@@ -27,10 +27,10 @@ from envs.sources.synthetic import straight_road
 from recipes import discriminator
 from recipes.common.cli import CONFIG
 from recipes.common.models import build_policy, policy_config, write_policy
-from recipes.common.rolled import Rolled
+from recipes.common.rolled import Rolled, driven_log
 from recipes.studies import adversary
 from recipes.studies.adversary import best_look, fit, measured_on
-from recipes.studies.motions import Motions, MotionShelf, Sight, driven_log
+from recipes.studies.motions import Motions, MotionShelf, Sight
 from recipes.studies.spurious import QUANTITIES, RANKINGS, Ranked, partial, summarise
 
 SMALL = ["num_rollouts=8", "memory=0.001", "training.num_rollouts=3", "training.steps=6", "training.look_interval=2"]
@@ -163,12 +163,12 @@ def test_a_shelf_of_other_options_is_told_and_kept(tmp_path: Path) -> None:
 def test_the_log_goes_through_the_tokens_of_the_policy_and_what_is_not_controlled_replays() -> None:
     scene, tokenizer = straight_road(3, seed=5), VerletTokenizer()
     log = log_trajectory(scene, 80)
-    driven = driven_log(scene, tokenizer, EpisodeOptions(max_controlled=1), tokenized=True)
+    driven = driven_log(scene, tokenizer, EpisodeOptions(max_controlled=1))
     moved = (driven - log)[..., :2].abs().amax((1, 2))
     assert moved[0] > 1e-3 and torch.equal(moved[1:], torch.zeros(2))
     bins = driven[0, 4::5, 0].diff(n=2) / tokenizer.bins[1, 0]
     assert torch.allclose(bins, bins.round(), atol=1e-3), "its displacements change by whole bins"
-    raw = driven_log(scene, tokenizer, EpisodeOptions(), tokenized=False)
+    raw = driven_log(scene, None, EpisodeOptions())
     assert torch.equal(raw[..., :2], log[..., :2])
 
 
