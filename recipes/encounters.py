@@ -17,19 +17,18 @@ from typing import Any
 
 import hydra
 from omegaconf import DictConfig
-from torch import Tensor
 
 from dpa.realism import Encounter, RealismConfig, compare, encounters, measure
 from envs.episode import EpisodeOptions
 from envs.files import write_json
-from envs.scene import AgentKind, Scene
+from envs.scene import AgentKind
 from envs.store import SceneStore
 from recipes.common.cli import CONFIG, plain, recipe
 from recipes.common.models import given_policies, open_policy, weights_digest
-from recipes.common.rolled import driven, logs
+from recipes.common.rolled import Rolled, driven, logs
 from recipes.common.scenes import open_splits
-from recipes.studies.rows import Roll, measure_row
-from recipes.studies.tables import StudyTable, minus, over_scenes, tell
+from recipes.studies.rows import Roll, measure_rows
+from recipes.studies.tables import StudyTable, compared, tell
 
 CLASSES = {AgentKind.VEHICLE: "vehicles", AgentKind.PEDESTRIAN: "pedestrians", AgentKind.CYCLIST: "cyclists"}
 MET = {
@@ -43,18 +42,17 @@ Figures = dict[str, dict[str, list[float | None]]]
 """By class and by how they met, the share of each scene; None where nobody of the class is evaluated."""
 
 
-def look(scene: Scene, trajectories: Tensor, metric: RealismConfig) -> dict[str, dict[str, float | None]]:
+def look(each: Rolled, metric: RealismConfig) -> dict[str, dict[str, float | None]]:
     """How the evaluated agents of each class met whom they collided with first.
 
     Args:
-        scene: uncollated.
-        trajectories: ``[R, A, 80, 4]`` of the present agents.
+        each: scene and rollouts.
         metric: whose collisions these are.
 
     Returns:
         Shares of (rollout, agent) pairs, ``all`` of them summed; None where nobody of the class is evaluated.
     """
-    comparison = compare(scene, trajectories, metric)
+    comparison = compare(each.scene, each.trajectories, metric)
     measured = measure([comparison], metric)[0]
     met = encounters(comparison.tracks, measured, metric)[1:]
     found: dict[str, dict[str, float | None]] = {}
@@ -74,48 +72,22 @@ def rows(cfg: DictConfig, files: Mapping[str, Path], scenes: SceneStore) -> Iter
         yield name, told | {"num_rollouts": cfg.num_rollouts}, partial(driven, scenes, model, options, cfg)
 
 
-def measure_encounters(cfg: DictConfig, files: Mapping[str, Path], scenes: SceneStore) -> dict[str, Figures]:
-    """Measure every row, or read it back.
-
-    Raises:
-        ValueError: a row was measured with other options.
-    """
-    metric, found = RealismConfig.load(str(cfg.metric)), {}
-    common = {"metric": metric.describe()}
-    for name, own, roll in rows(cfg, files, scenes):
-        measured = measure_row(
-            cfg.output, name, common | own, scenes, roll, lambda each: look(each.scene, each.trajectories, metric)
-        )
-        found[name] = {
-            kind: {how: [each[kind][how] for each in measured] for how in (ALL, *MET.values())}
-            for kind in CLASSES.values()
-        }
-    return found
-
-
-def tables(found: dict[str, Figures], names: Sequence[str]) -> Iterator[StudyTable]:
+def tables(found: Mapping[str, Figures], names: Sequence[str]) -> Iterator[StudyTable]:
     """Of each class every row with intervals over scenes, and each further policy minus the first, scene by scene.
 
     Args:
-        found: of :func:`measure_encounters`.
+        found: a value for each scene by row, class and how they met.
         names: of the policies.
     """
     first, *others = names
-    columns = [ALL, *MET.values()]
     for kind in CLASSES.values():
         shares = {name: figures[kind] for name, figures in found.items()}
         known = sum(value is not None for value in shares[first][ALL])
-        if not known:
-            continue
-        titles = [f"{kind} collide", *columns]
-        cells = {name: [over_scenes(each[column]) for column in columns] for name, each in shares.items()}
-        yield StudyTable(kind, f"{known} scenes with {kind}", titles, cells, signed=False)
-        if others:
-            less = {
-                name: [over_scenes(minus(shares[name][each], shares[first][each])) for each in columns]
-                for name in others
-            }
-            yield StudyTable(f"{kind}_difference", f"minus {first}, scene by scene", titles, less)
+        if known:
+            columns = [f"{kind} collide", ALL, *MET.values()]
+            yield from compared(
+                kind, f"{known} scenes with {kind}", columns, shares, dict.fromkeys(others, first), first
+            )
 
 
 @hydra.main(**CONFIG, config_name="encounters")
@@ -124,7 +96,9 @@ def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.encounters``."""
     policies = given_policies(cfg)
     scenes = open_splits(cfg.scenes)[cfg.split]
-    found = measure_encounters(cfg, policies, scenes)
+    metric = RealismConfig.load(str(cfg.metric))
+    common = {"metric": metric.describe()}
+    found = measure_rows(cfg.output, common, scenes, rows(cfg, policies, scenes), partial(look, metric=metric))
     tell(cfg, list(tables(found, list(policies))), {})
     if cfg.json is not None:
         write_json(cfg.json, {"scenes": len(scenes), "rows": found})

@@ -41,8 +41,8 @@ from recipes.common.cli import CONFIG, build, plain, recipe
 from recipes.common.models import given_policies, open_policy, weights_digest
 from recipes.common.rolled import Rolled, driven, logs, waiting
 from recipes.common.scenes import open_splits
-from recipes.studies.rows import Roll, measure_row
-from recipes.studies.tables import StudyTable, minus, over_scenes, tell
+from recipes.studies.rows import Roll, measure_rows
+from recipes.studies.tables import StudyTable, compared, tell
 
 PLACES = ("single decisions", "alone", "among its own")
 """Where a policy is looked at."""
@@ -106,12 +106,11 @@ def rows(cfg: DictConfig, files: Mapping[str, Path], scenes: SceneStore) -> Iter
             yield f"{name}: {row}" if several else row, own, roll
 
 
-def look(scene: Scene, trajectories: Tensor, metric: RealismConfig) -> dict[str, float | None]:
+def look(each: Rolled, metric: RealismConfig) -> dict[str, float | None]:
     """What becomes of the self-driving car by each of :data:`SECONDS`; shares and means over rollouts.
 
     Args:
-        scene: uncollated.
-        trajectories: ``[R, A, 80, 4]`` of the present agents.
+        each: scene and rollouts.
         metric: whose measurements these are.
 
     Returns:
@@ -120,7 +119,7 @@ def look(scene: Scene, trajectories: Tensor, metric: RealismConfig) -> dict[str,
     Raises:
         ValueError: the scene has no self-driving car.
     """
-    scene, trajectories = _to_the_end(scene, trajectories)
+    scene, trajectories = _to_the_end(each.scene, each.trajectories)
     comparison = compare(scene, trajectories, metric)
     measured, agents = measure([comparison], metric)[0], scene.agents
     row = torch.isin(measured.track_id, agents.track_id[agents.sdc]).nonzero()
@@ -152,45 +151,20 @@ def _last(seconds: float) -> int:
     return round(seconds / STEP_SECONDS) - 1
 
 
-def measure_gap(
-    cfg: DictConfig, files: Mapping[str, Path], scenes: SceneStore
-) -> dict[str, dict[str, list[float | None]]]:
-    """Measure every row, or read it back; ``{row: {figure: one value per scene}}``.
-
-    Raises:
-        ValueError: a row was measured with other options.
-    """
-    metric, gap = RealismConfig.load(str(cfg.metric)), {}
-    common = {"num_rollouts": cfg.num_rollouts, "seed": cfg.seed, "metric": metric.describe()}
-    for name, own, roll in rows(cfg, files, scenes):
-        measured = measure_row(
-            cfg.output, name, common | own, scenes, roll, lambda each: look(each.scene, each.trajectories, metric)
-        )
-        gap[name] = {figure: [each[figure] for each in measured] for figure in measured[0]}
-    return gap
-
-
-def tables(gap: dict[str, dict[str, list[float | None]]], names: Sequence[str], num_scenes: int) -> list[StudyTable]:
+def tables(
+    gap: Mapping[str, Mapping[str, Sequence[float | None]]], names: Sequence[str], num_scenes: int
+) -> Iterator[StudyTable]:
     """Every row with intervals over scenes, and each further policy minus the first, scene by scene.
 
     Args:
-        gap: of :func:`measure_gap`; a figure counts the scenes in which the log is still there.
+        gap: a value for each scene by row and figure; a figure counts the scenes in which the log is still there.
         names: of the policies.
         num_scenes: of all.
     """
-    columns = list(next(iter(gap.values())))
-    rows = {name: [over_scenes(figures[column]) for column in columns] for name, figures in gap.items()}
-    title = f"the self-driving car in {num_scenes} scenes"
-    found = [StudyTable("gap", title, ["driven by", *columns], rows, signed=False)]
     first, *others = names
-    if others:
-        pairs = {f"{name}: {place}": f"{first}: {place}" for name in others for place in PLACES}
-        rows = {
-            row: [over_scenes(minus(gap[row][column], gap[of_first][column])) for column in columns]
-            for row, of_first in pairs.items()
-        }
-        found.append(StudyTable("gap_difference", f"minus {first}, scene by scene", ["driven by", *columns], rows))
-    return found
+    columns = ["driven by", *next(iter(gap.values()))]
+    pairs = {f"{name}: {place}": f"{first}: {place}" for name in others for place in PLACES}
+    yield from compared("gap", f"the self-driving car in {num_scenes} scenes", columns, gap, pairs, first)
 
 
 @hydra.main(**CONFIG, config_name="gap")
@@ -199,8 +173,10 @@ def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.gap``."""
     policies = given_policies(cfg)
     scenes = open_splits(cfg.scenes)[cfg.split]
-    gap = measure_gap(cfg, policies, scenes)
-    tell(cfg, tables(gap, list(policies), len(scenes)), {})
+    metric = RealismConfig.load(str(cfg.metric))
+    common = {"num_rollouts": cfg.num_rollouts, "seed": cfg.seed, "metric": metric.describe()}
+    gap = measure_rows(cfg.output, common, scenes, rows(cfg, policies, scenes), partial(look, metric=metric))
+    tell(cfg, list(tables(gap, list(policies), len(scenes))), {})
     if cfg.json is not None:
         write_json(cfg.json, {"scenes": len(scenes), "rows": gap})
 

@@ -37,7 +37,7 @@ from recipes.common.models import (
 )
 from recipes.common.rolled import Rolled, driven, final_spread
 from recipes.common.scenes import open_splits
-from recipes.studies.rows import Roll, measure_row
+from recipes.studies.rows import Roll, measure_rows
 from recipes.studies.rungs import (
     Simulator,
     constant_velocity,
@@ -122,11 +122,9 @@ def climb(cfg: DictConfig, policies: Mapping[str, Path], scenes: SceneStore) -> 
         "years": {year: metric.describe() for year, metric in metrics.items()},
         "figures": list(FIGURES),
     }
-    ladder = {}
-    for name, own, roll in rungs(cfg, policies, scenes):
-        measured = measure_row(cfg.output, name, common | own, scenes, roll, partial(measure_scene, metrics=metrics))
-        ladder[name] = {year: {key: [each[year][key] for each in measured] for key in FIGURES} for year in metrics}
-    return ladder
+    return measure_rows(
+        cfg.output, common, scenes, rungs(cfg, policies, scenes), partial(measure_scene, metrics=metrics)
+    )
 
 
 def years_of(cfg: DictConfig) -> list[str]:

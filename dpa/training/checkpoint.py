@@ -51,6 +51,10 @@ _HELD = {"training": ("step",), "policy": ("policy", "metadata")}
 _RESERVED = ("format", "kind", "step", "config", "versions")
 
 
+KEPT = 2
+"""Checkpoints of a run: one is left if the newest turns out damaged."""
+
+
 class CheckpointError(ValueError):
     """A file is no usable checkpoint; the message names it and says the fix."""
 
@@ -70,21 +74,12 @@ class Checkpointer:
 
     Args:
         folder: made when the first checkpoint is saved.
-        keep_last: how many to keep. Two or more, so that one is left if the newest turns out damaged.
         config: the model's configuration (plain dicts, lists, numbers, strings), written into every checkpoint and
             compared when one is read.
-
-    Raises:
-        ValueError: ``keep_last`` is not positive.
     """
 
-    def __init__(
-        self, folder: str | os.PathLike[str], keep_last: int = 2, config: Mapping[str, Any] | None = None
-    ) -> None:
-        if keep_last < 1:
-            raise ValueError(f"keep_last must be 1 or more, got {keep_last}.")
+    def __init__(self, folder: str | os.PathLike[str], config: Mapping[str, Any] | None = None) -> None:
         self.folder = Path(folder)
-        self.keep_last = keep_last
         self.config = None if config is None else dict(config)
 
     def save(self, step: int, state: Mapping[str, Any]) -> Path:
@@ -112,7 +107,7 @@ class Checkpointer:
         _write(path, {**_header("training", self.config), "step": step, **state})
         newest_first = self._paths()
         here = newest_first.index(path)
-        for obsolete in newest_first[:here] + newest_first[here + self.keep_last :]:
+        for obsolete in newest_first[:here] + newest_first[here + KEPT :]:
             obsolete.unlink()
         return path
 
@@ -153,22 +148,16 @@ class Checkpointer:
         return sorted((p for p in self.folder.iterdir() if _NAME.fullmatch(p.name)), reverse=True)
 
 
-def capture(
-    parts: Mapping[str, Stateful],
-    generators: Mapping[str, torch.Generator] | None = None,
-    progress: Mapping[str, Any] | None = None,
-) -> dict[str, Any]:
-    """Everything a run needs to go on: its parts, all random generators, and its counters.
+def capture(parts: Mapping[str, Stateful], progress: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Everything a run needs to go on: its parts, the global random generators, and its counters.
 
     Args:
         parts: modules, optimiser, scheduler, ... by name.
-        generators: the run's own generators by name; the global ones of Python, NumPy and torch are always taken.
         progress: counters and other plain values; read them back as ``saved["progress"]``.
     """
     name, keys, *rest = np.random.get_state()
     return {
         "parts": {part: stateful.state_dict() for part, stateful in parts.items()},
-        "generators": {key: generator.get_state() for key, generator in (generators or {}).items()},
         "global_rng": {
             "python": random.getstate(),
             "numpy": (name, keys.tolist(), *rest),
@@ -179,11 +168,7 @@ def capture(
     }
 
 
-def restore(
-    saved: Mapping[str, Any],
-    parts: Mapping[str, Stateful],
-    generators: Mapping[str, torch.Generator] | None = None,
-) -> None:
+def restore(saved: Mapping[str, Any], parts: Mapping[str, Stateful]) -> None:
     """Put a run back to where :func:`capture` found it.
 
     The states of the GPUs' global generators are taken over only where the number of GPUs is the same; on other
@@ -192,24 +177,20 @@ def restore(
     Args:
         saved: what :meth:`Checkpointer.latest` returned.
         parts: the same names as given to :func:`capture`, freshly built.
-        generators: likewise.
 
     Raises:
         ValueError: the names differ, or a module has other parameters than the checkpoint.
     """
-    for what, ours in (("parts", parts), ("generators", generators or {})):
-        if set(saved[what]) != set(ours):
-            raise ValueError(
-                f"the checkpoint has the {what} {sorted(saved[what])}, the run {sorted(ours)}; resume with the recipe "
-                "and options that wrote it."
-            )
+    if set(saved["parts"]) != set(parts):
+        raise ValueError(
+            f"the checkpoint has the parts {sorted(saved['parts'])}, the run {sorted(parts)}; resume with the recipe "
+            "and options that wrote it."
+        )
     for name, part in parts.items():
         if isinstance(part, nn.Module):
             load_weights(part, saved["parts"][name], saved.get("config"), where=f"checkpoint part {name!r}")
         else:
             part.load_state_dict(saved["parts"][name])
-    for name, generator in (generators or {}).items():
-        generator.set_state(saved["generators"][name])
     rng = saved["global_rng"]
     random.setstate(rng["python"])
     np.random.set_state(rng["numpy"])

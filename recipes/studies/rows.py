@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,25 @@ Roll = Callable[[frozenset[int]], Iterator[Rolled]]
 """Rolls out the scenes that are not done, in any order."""
 Measure = Callable[[Rolled], dict[str, Any]]
 """Numbers of one scene from its rollouts, ready for JSON."""
+
+
+def measure_rows(
+    folder: str | Path,
+    decided_by: dict[str, Any],
+    scenes: SceneStore,
+    rows: Iterable[tuple[str, dict[str, Any], Roll]],
+    measure: Measure,
+) -> dict[str, dict[str, Any]]:
+    """:func:`measure_row` of each ``(name, what else decides it, roll)``: ``{row: {figure: one value per scene}}``."""
+    return {
+        name: _by_figure(measure_row(folder, name, decided_by | own, scenes, roll, measure)) for name, own, roll in rows
+    }
+
+
+def _by_figure(values: list[Any]) -> Any:
+    if not isinstance(values[0], dict):
+        return values
+    return {name: _by_figure([each[name] for each in values]) for name in values[0]}
 
 
 def measure_row(

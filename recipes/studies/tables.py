@@ -42,6 +42,25 @@ def minus(values: Sequence[float | None], others: Sequence[float | None]) -> lis
     return [None if one is None else one - other for one, other in zip(values, others, strict=True)]
 
 
+def compared(
+    name: str,
+    title: str,
+    columns: Sequence[str],
+    found: Mapping[str, Mapping[str, Sequence[float | None]]],
+    pairs: Mapping[str, str],
+    first: str,
+) -> Iterator[StudyTable]:
+    """Rows of a value per scene with intervals, and some minus the row that ``pairs`` names, which is of ``first``."""
+    rows = {row: [over_scenes(figures[each]) for each in columns[1:]] for row, figures in found.items()}
+    yield StudyTable(name, title, columns, rows, signed=False)
+    if pairs:
+        less = {
+            row: [over_scenes(minus(found[row][each], found[other][each])) for each in columns[1:]]
+            for row, other in pairs.items()
+        }
+        yield StudyTable(f"{name}_difference", f"minus {first}, scene by scene", columns, less)
+
+
 @dataclass(frozen=True)
 class StudyTable:
     """What a study found, row by row.

@@ -21,7 +21,7 @@ from envs.scene import CURRENT_STEP, MapKind, Scene
 from envs.sources.synthetic import build_scene, straight_road
 from recipes.common.cli import CONFIG
 from recipes.common.models import build_policy, policy_config, write_policy
-from recipes.common.rolled import logs
+from recipes.common.rolled import Rolled, logs
 from recipes.gap import PLACES, look, single_decisions, tables
 
 METRIC = RealismConfig.load("2024")
@@ -60,7 +60,7 @@ def test_a_car_that_catches_up_collides_by_the_time_that_it_does() -> None:
     scene = two_cars()
     faster = logged(scene).repeat(2, 1, 1, 1)
     faster[1, 0, :, 0] += 0.5 * torch.arange(1, 81)
-    found = look(scene, faster, METRIC)
+    found = look(Rolled.of(0, scene, faster), METRIC)
     assert found["collision 2 s"] == 0.0 and found["collision 8 s"] == 0.5, "in one of two rollouts"
     assert found["away [m] 2 s"] == pytest.approx(5.0) and found["away [m] 8 s"] == pytest.approx(20.0), (
         "means over both"
@@ -72,7 +72,7 @@ def test_of_a_log_that_has_ended_nothing_is_known() -> None:
     faster = logged(scene)[None].clone()
     faster[:, 0, :, 0] += 0.5 * torch.arange(1, 81)
     scene.agents.valid[0, CURRENT_STEP + 31 :] = False
-    found = look(scene, faster, METRIC)
+    found = look(Rolled.of(0, scene, faster), METRIC)
     assert found["away [m] 2 s"] == pytest.approx(10.0) and found["collision 2 s"] == 0.0
     assert all(found[f"{name} 8 s"] is None for name in ("collision", "off-road", "away [m]"))
 
@@ -83,14 +83,14 @@ def test_nobody_runs_into_an_agent_whose_log_has_ended() -> None:
     log = logged(scene)[None].clone()
     scene.agents.valid[1, CURRENT_STEP + 31 :] = False
     log[:, 1, 30:, 0] = log[:, 1, 30:31, 0]
-    assert look(scene, log, METRIC)["collision 8 s"] == 0.0
+    assert look(Rolled.of(0, scene, log), METRIC)["collision 8 s"] == 0.0
 
 
 def test_a_scene_without_a_self_driving_car_is_refused() -> None:
     scene = two_cars()
     scene.agents.sdc = torch.zeros(2, dtype=torch.bool)
     with pytest.raises(ValueError, match="has no self-driving car"):
-        look(scene, logged(scene)[None], METRIC)
+        look(Rolled.of(0, scene, logged(scene)[None]), METRIC)
 
 
 def rows(scene: Scene, model: type[MotionLM]) -> tuple[Tensor, Tensor, Tensor]:
@@ -126,7 +126,7 @@ def test_a_further_policy_is_told_minus_the_first_scene_by_scene() -> None:
     assert values.rows["one: alone"][0].mean == 0.375 and values.rows["one: alone"][0].num_scenes == 2
     found = {name: cells[0].mean for name, cells in minus.rows.items()}
     assert found == {"two: single decisions": 0.0, "two: alone": -0.375, "two: among its own": 0.0}
-    assert len(tables({"log": {"collision": [0.0]}}, ["one"], 1)) == 1, "one policy has nothing to be set against"
+    assert len(list(tables({"log": {"collision": [0.0]}}, ["one"], 1))) == 1, "one policy has nothing to be set against"
 
 
 @pytest.fixture(scope="module")

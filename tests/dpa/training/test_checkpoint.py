@@ -26,7 +26,6 @@ from dpa.training.checkpoint import (
 from dpa.training.optim import clip_and_step, make_optimizer, make_schedule
 from dpa.training.seeding import seed_everything
 from envs.files import PARTIAL_PREFIX
-from envs.seeding import make_generator
 
 CONFIG = {"width": 8, "layers": [8, 8]}
 
@@ -39,13 +38,11 @@ class Run:
         self.model = nn.Sequential(nn.Linear(4, 8), nn.LayerNorm(8), nn.Dropout(0.5), nn.Linear(8, 1))
         self.optimizer = make_optimizer(self.model, lr=1e-2, weight_decay=0.1)
         self.schedule = make_schedule(self.optimizer, steps, warmup_steps=2)
-        self.batches = make_generator(0, "batches")
         self.parts = {"model": self.model, "optimizer": self.optimizer, "schedule": self.schedule}
-        self.generators = {"batches": self.batches}
 
     def train(self, steps: int) -> None:
         for _ in range(steps):
-            inputs = torch.randn(16, 4, generator=self.batches) * random.random() + np.random.rand()
+            inputs = torch.randn(16, 4) * random.random() + np.random.rand()
             self.model(inputs).square().mean().backward()
             clip_and_step(self.optimizer, max_norm=1.0, schedule=self.schedule)
 
@@ -56,22 +53,21 @@ def test_a_resumed_run_ends_with_the_same_bits_as_an_uninterrupted_one(tmp_path:
 
     first = Run(steps=10)
     first.train(5)
-    Checkpointer(tmp_path, config=CONFIG).save(5, capture(first.parts, first.generators, {"epoch": 1}))
+    Checkpointer(tmp_path, config=CONFIG).save(5, capture(first.parts, {"epoch": 1}))
     second = Run(steps=10)
     second.train(3)  # whatever happened before must not matter
     saved = Checkpointer(tmp_path, config=CONFIG).latest()
-    restore(saved, second.parts, second.generators)
+    restore(saved, second.parts)
     second.train(10 - saved["step"])
 
     assert saved["progress"] == {"epoch": 1}
     for name, value in whole.model.state_dict().items():
         assert torch.equal(second.model.state_dict()[name], value), name
     assert second.schedule.get_last_lr() == whole.schedule.get_last_lr()
-    assert torch.equal(second.batches.get_state(), whole.batches.get_state())
 
 
 def test_only_the_last_checkpoints_are_kept_and_the_newest_is_read(tmp_path: Path) -> None:
-    checkpoints = Checkpointer(tmp_path, keep_last=2)
+    checkpoints = Checkpointer(tmp_path)
     assert checkpoints.latest() is None
     for step in (1, 2, 3, 11):
         checkpoints.save(step, {"x": torch.tensor(step)})
@@ -80,7 +76,7 @@ def test_only_the_last_checkpoints_are_kept_and_the_newest_is_read(tmp_path: Pat
 
 
 def test_saving_an_earlier_step_removes_the_abandoned_future(tmp_path: Path) -> None:
-    checkpoints = Checkpointer(tmp_path, keep_last=2)
+    checkpoints = Checkpointer(tmp_path)
     for step in (10, 20, 15):
         checkpoints.save(step, {})
     assert checkpoints.latest()["step"] == 15
@@ -166,9 +162,9 @@ def test_a_checkpoint_of_another_configuration_is_refused_naming_both(tmp_path: 
 
 def test_resuming_with_other_parts_is_refused(tmp_path: Path) -> None:
     run = Run(steps=4)
-    Checkpointer(tmp_path).save(1, capture(run.parts, run.generators))
-    with pytest.raises(ValueError, match=r"generators \['batches'\], the run \[\]"):
-        restore(Checkpointer(tmp_path).latest(), run.parts)
+    Checkpointer(tmp_path).save(1, capture(run.parts))
+    with pytest.raises(ValueError, match=r"parts \['model', 'optimizer', 'schedule'\], the run \['model'\]"):
+        restore(Checkpointer(tmp_path).latest(), {"model": run.model})
 
 
 def test_a_policy_comes_back_with_its_configuration_and_origin(tmp_path: Path) -> None:
