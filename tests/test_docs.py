@@ -435,7 +435,7 @@ def test_the_tables_of_a_study_of_rankings_are_those_of_the_values_of_its_scenes
     summary, folder = study.summaries[name], study.folder / name
     policies = {policy: folder / f"{policy.replace('/', '_')}.json" for policy in summary["made"]["policies"]}
     measured = {policy: json.loads(path.read_text())["per_scene"] for policy, path in policies.items()}
-    assert len(measured) == 5
+    assert len(measured) >= 3
     if name == "validity":
         assert leaves(as_json(validity.summarise(measured))) == pytest.approx(leaves(summary["rankings"]))
         for ranking in summary["rankings"].values():
@@ -447,13 +447,13 @@ def test_the_tables_of_a_study_of_rankings_are_those_of_the_values_of_its_scenes
         for ranking in spurious.RANKINGS:
             ends = (summary["realism"][ranking][end]["realism"] for end in ("best", "worst"))
             assert " | ".join(in_a_cell(end, 3) for end in ends) in told
-    runs = {"sumo": "study", "gpudrive": "real"}[summary["made"]["config"]["scenes"]["source"]]
-    (options,) = re.findall(rf"^ +python -m recipes\.{name} (.* output=runs/{runs}/{name})$", told, re.MULTILINE)
+    made = summary["made"]["config"]
+    (options,) = re.findall(rf"^ +python -m recipes\.{name} (.* output={made['output']})$", told, re.MULTILINE)
     with initialize_config_dir(str(CONFIG), version_base="1.3"):
         given = OmegaConf.to_container(compose(name, shlex.split(options)), resolve=True)
-    made = summary["made"]["config"]
-    (pattern,) = given.pop("policies")
-    assert len(fnmatch.filter(summary["made"]["policies"], pattern)) == 5 and made.pop("policies")
+    patterns = [each.removeprefix("zoo:") for each in given.pop("policies")]
+    asked = {each for each in measured if any(fnmatch.fnmatch(each, pattern) for pattern in patterns)}
+    assert asked == set(measured) and made.pop("policies")
     differing = {key for key in made if made[key] != given[key]}
     assert differing <= {"scenes"}, "where scenes are kept"
     assert [made["scenes"][split] for split in SPLITS] == [given["scenes"][split] for split in SPLITS]
