@@ -79,6 +79,17 @@ def spreads(rollouts: Iterable[Rolled], names: Sequence[str]) -> list[Spread]:
     return [Spread(*row) for row in zip(names, *columns, strict=True)]
 
 
+def weights_of(rows: Iterable[Spread]) -> str:
+    """Weights normalised by measured spreads, as an option of a ranking; a feature that never differs keeps its own.
+
+    Examples:
+        >>> weights_of([Spread("collision", 0.1, 0.1, 0.5), Spread("speed", 2.0, 0.9, 0.5)])
+        '{collision:1e+03,speed:0.25}'
+    """
+    weights = {row.feature: FEATURES[row.feature].weight / (row.spread or 1.0) ** 2 for row in rows}
+    return "{" + ",".join(f"{name}:{weight:.3g}" for name, weight in weights.items()) + "}"
+
+
 @hydra.main(**CONFIG, config_name="spread")
 @recipe
 def main(cfg: DictConfig) -> None:
@@ -99,6 +110,7 @@ def main(cfg: DictConfig) -> None:
         numbers = (f"{row.spread:.3g}", f"{row.paper:.1%}", f"{row.normalised:.1%}")
         table.add_row(row.feature, feature.unit, f"{feature.weight:g}", *numbers)
     Console(markup=False, width=100).print(table)
+    print(f"weights that these spreads normalise: 'ranking.weights={weights_of(rows)}'")
     if cfg.json is not None:
         write_json(cfg.json, [row._asdict() for row in rows])
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from dpa.ranking import PreferenceDistance
-from dpa.ranking.features import feature_names, log_trajectory
+from dpa.ranking.features import feature_names, feature_weights, log_trajectory
 from envs.sources.synthetic import straight_road
 from recipes.common.cli import build
 from recipes.common.rolled import Rolled
@@ -41,6 +43,10 @@ def test_the_recipe_measures_every_feature_that_is_asked_for(
     assert rows["speed"]["spread"] > 0
     assert rows["red_light"]["spread"] == 0
     assert sum(row["normalised"] for row in rows.values()) == pytest.approx(1)
+    (told,) = re.findall(r"'(ranking\.weights=.*)'", outcome.out)
+    weights = feature_weights(list(rows), OverridesParser.create().parse_override(told).value())
+    assert weights[0] * rows["speed"]["spread"] ** 2 == pytest.approx(1.0, rel=5e-3)
+    assert weights[2] == 10.0, "what never differs keeps its weight"
 
 
 def test_rollouts_of_another_policy_are_refused(run: Callable, options: Callable, runs: Path) -> None:
