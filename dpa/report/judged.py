@@ -14,9 +14,8 @@ from torch import Tensor
 
 from dpa.ranking import PreferenceDistance, rank_of
 from dpa.ranking.features import feature_names
-from envs.devices import of_rows
+from dpa.safety.off_road import off_road
 from envs.geometry.boxes import nearest_box_distance
-from envs.geometry.edges import RoadEdges
 from envs.scene import EDGE_KINDS, Scene, polylines
 
 COUPLING_STRIDE = 5
@@ -200,9 +199,7 @@ def _mishaps(scene: Scene, poses: Tensor, extent: Tensor, there: Tensor) -> tupl
     size = extent[None, :, None].expand(*poses.shape[:-1], 3)
     boxes = torch.cat((poses[..., [0, 1, 3]], size[..., :2]), -1).transpose(1, 2).contiguous()
     nearest = nearest_box_distance(boxes, there.transpose(1, 2).contiguous()).transpose(1, 2)
-    edges = RoadEdges.from_polylines(lines)
-    beyond = of_rows(there, edges.box_offroad_distance, poses[..., :3], poses[..., 3], size)
-    return (nearest < 0) & there, beyond > 0
+    return (nearest < 0) & there, off_road(lines, poses, extent, there)
 
 
 def couple(distance: PreferenceDistance, scene: Scene, trajectories: Tensor, agents: Tensor) -> Couplings:

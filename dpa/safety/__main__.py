@@ -18,8 +18,7 @@ from torch import Tensor
 
 from dpa.safety.measure import MEASURES, safety
 from dpa.safety.motion import NOW
-from envs.devices import of_rows
-from envs.geometry.edges import RoadEdges
+from dpa.safety.off_road import off_road
 from envs.progress import progress
 from envs.scene import EDGE_KINDS, AgentKind, Scene, polylines
 from envs.store import SceneStore
@@ -37,9 +36,7 @@ def leaves_road(scene: Scene) -> Tensor:
     """``[A]`` bool: an agent of an uncollated scene is off the road at some step of its log after the current one."""
     agents = scene.agents
     poses, there = agents.trajectory[:, NOW + 1 :], agents.valid[:, NOW + 1 :]
-    size = agents.extent[:, None].expand(*there.shape, 3)
-    edges = RoadEdges.from_polylines(polylines(scene, EDGE_KINDS))
-    return (of_rows(there, edges.box_offroad_distance, poses[..., :3], poses[..., 3], size) > 0).any(-1)
+    return off_road(polylines(scene, EDGE_KINDS), poses, agents.extent, there).any(-1)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -63,7 +63,7 @@ class Motion:
                 f"scene {scene.scene_id} has {num} present agents, so controlled is [{num}] bool, got "
                 f"{list(controlled.shape)} {controlled.dtype}."
             )
-        history = agents.trajectory[present][None, :, : NOW + 1].to(trajectories).expand(len(trajectories), -1, -1, -1)
+        history = agents.trajectory[None, present, : NOW + 1].to(trajectories).expand(len(trajectories), -1, -1, -1)
         valid = agents.valid[present][:, : NOW + 1 + steps]
         return cls(scene, torch.cat((history, trajectories), 2), valid, controlled)
 

@@ -87,8 +87,7 @@ def pose_tracks(scene: Scene, trajectories: Tensor | None = None) -> Tensor:
         tensor([-1.,  0.,  0.])
     """
     agents = scene.agents
-    poses = agents.poses
-    poses = torch.where(agents.valid[..., None], poses, torch.nan)
+    poses = torch.where(agents.valid[..., None], agents.poses, torch.nan)
     if trajectories is None:
         return poses
     num_present, horizon = int(agents.present.sum()), LOG_STEPS - CURRENT_STEP - 1

@@ -29,6 +29,20 @@ def test_corners_run_counter_clockwise_from_the_front_left_one() -> None:
     torch.testing.assert_close(box_corners(turned), expected)
 
 
+@settings(max_examples=20, deadline=None)
+@given(x=st.floats(-50, 50), y=st.floats(-50, 50), heading=st.floats(-4, 4), length=st.floats(0.5, 20))
+def test_a_box_has_its_size_its_centre_and_turns_left(x: float, y: float, heading: float, length: float) -> None:
+    corners = box_corners(torch.tensor([x, y, heading, length, 1.5])).double()
+    torch.testing.assert_close(corners.mean(0), torch.tensor([x, y], dtype=torch.float64), atol=1e-4, rtol=0)
+    nxt = corners.roll(-1, 0)
+    area = ((corners[:, 0] * nxt[:, 1] - corners[:, 1] * nxt[:, 0]).sum() / 2).item()
+    assert area == pytest.approx(1.5 * length, abs=0.02)
+    front = (corners[0] + corners[3]) / 2 - corners.mean(0)
+    assert (front @ torch.tensor([math.cos(heading), math.sin(heading)], dtype=torch.float64)).item() == pytest.approx(
+        length / 2, abs=1e-4
+    )
+
+
 def test_gap_of_boxes_in_file_is_the_distance_between_bumpers() -> None:
     ahead = torch.tensor([7.0, 0.3, 0.0, 4.0, 2.0])
     assert signed_box_distance(CAR, ahead).item() == pytest.approx(3.0)

@@ -16,9 +16,8 @@ from recipes.encounters import ALL, CLASSES, MET, look, tables
 
 
 def test_shares_of_a_class_add_up_and_a_class_that_is_not_there_has_none() -> None:
-    found = look(
-        Rolled.of(0, straight_road(2), torch.zeros(4, 2, 80, 4)), RealismConfig.load("2024")
-    )  # all on one spot
+    on_one_spot = Rolled.of(0, straight_road(2), torch.zeros(4, 2, 80, 4))
+    found = look(on_one_spot, RealismConfig.load("2024"))
     vehicles = found.pop("vehicles")
     assert vehicles.pop(ALL) == 1.0 == sum(vehicles.values()) and vehicles["beside"] == 1.0
     assert all(value is None for shares in found.values() for value in shares.values())

@@ -185,9 +185,7 @@ def _motion(scene: Scene, trajectories: Tensor, ego: Tensor | None, stride: int)
     if not 1 <= stride <= steps:
         raise ValueError(f"stride must be 1 to {steps} (the number of steps), got {stride}.")
     history, device = slice(CURRENT_STEP + 1 - CONTEXT, CURRENT_STEP + 1), trajectories.device
-    before = (
-        scene.agents.trajectory[scene.agents.present, history].to(trajectories).expand(len(trajectories), -1, -1, -1)
-    )
+    before = agents.trajectory[present, history].to(trajectories).expand(len(trajectories), -1, -1, -1)
     return Motion(
         scene=scene,
         poses=torch.cat((before, trajectories), 2),

@@ -154,8 +154,7 @@ def _rows(scene: Scene, tracks: Tracks, now: int, origin: str) -> np.ndarray:
 def _present_poses(scene: Scene) -> np.ndarray:
     """``[A, 3]`` at the current step."""
     agents = scene.agents
-    poses = agents.poses
-    return poses[agents.present, CURRENT_STEP].numpy().astype(np.float64)
+    return agents.poses[agents.present, CURRENT_STEP].numpy().astype(np.float64)
 
 
 def _joined(log: Recording, ahead: Recording, rows: np.ndarray, now: int) -> Recording:
