@@ -11,8 +11,8 @@ from dpa.report.study import Evaluations
 from dpa.report.table import REFERENCE, measured, number
 
 UNSEEN = {"wrong_way": "wrong way", "red_light": "red light"}
-RELATED = {"close_pass": "close pass", "harsh_jerk": "harsh jerk"}
-"""Computed otherwise than the features of the distance, but relatives of its clearance and effort."""
+RELATED = {"close_pass": "close pass", "harsh_jerk": "harsh jerk", "standing_moved": "standing moved"}
+"""Computed otherwise than the features of the distance, but relatives of its clearance, effort and speed."""
 SEEN = {"collision_rate": "collision", "offroad_rate": "off-road"}
 """In the paper's features of the preference distance, and in the metric."""
 MEASURES = UNSEEN | RELATED | SEEN
@@ -54,7 +54,7 @@ def groups_of(experiment: Experiment) -> dict[str, Mapping[str, str]]:
         weighed = {"red_light": unseen.pop("red_light")}
     return {
         "Safety that neither the paper's preference distance nor the metric sees": unseen,
-        "Relatives of the distance's clearance and effort, measured otherwise": RELATED,
+        "Relatives of the distance's clearance, effort and speed, measured otherwise": RELATED,
         f"Safety that the metric of {experiment.metric} sees, and the paper's preference distance does not": weighed,
         "Safety that both the paper's preference distance and the metric see": SEEN,
     }

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.objectives import LossModule
 
 from dpa.losses import PolicyGradientLoss, token_network
 from dpa.models import collate_contexts, make_context
@@ -62,6 +64,24 @@ def test_with_a_clip_it_is_the_surrogate_of_ppo(network: tuple, groups: TensorDi
             held.append(clipped < ratio * advantage)
     assert found["loss_objective"].item() == pytest.approx(sum(costs) / len(costs), abs=1e-5)
     assert found["clip_fraction"].item() == pytest.approx(sum(held) / len(held))
+
+
+def test_divergence_and_entropy_are_sums_over_the_vocabulary(
+    network: tuple, groups: TensorDict, trained: Callable[[LossModule], torch.Tensor]
+) -> None:
+    actor, before = network
+    loss = PolicyGradientLoss(actor, kl=0.3, entropy=0.02)
+    now = trained(loss).log_softmax(-1)
+    drift, entropy = [], []
+    for place in VALID:
+        ours, theirs = now[place].tolist(), before.log_softmax(-1)[place].tolist()
+        drift.append(sum(math.exp(p) * (p - q) for p, q in zip(ours, theirs, strict=True)))
+        entropy.append(-sum(math.exp(p) * p for p in ours))
+    found = loss(groups)
+    assert found["kl"].item() == pytest.approx(sum(drift) / len(drift), abs=1e-5)
+    assert found["entropy"].item() == pytest.approx(sum(entropy) / len(entropy), abs=1e-5)
+    assert found["loss_kl_to_ref"].item() == pytest.approx(0.3 * sum(drift) / len(drift), abs=1e-5)
+    assert found["loss_entropy"].item() == pytest.approx(-0.02 * sum(entropy) / len(entropy), abs=1e-5)
 
 
 @pytest.fixture

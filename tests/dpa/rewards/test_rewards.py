@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import partial
 
@@ -132,6 +133,24 @@ def test_a_measure_of_safety_costs_who_does_what_it_is_about() -> None:
     assert REWARDS["red_light"](outcome_of(scene, through))[:, 0, 0].tolist() == [-1, 0]
     nowhere = straight_road(1)
     assert not REWARDS["red_light"](outcome_of(nowhere, lagging(nowhere, 0.0, 1.0))).any(), "there is no light"
+
+
+def test_driving_backwards_and_stopping_dead_cost_the_one_who_does_it() -> None:
+    scene = straight_road(2)
+    rollouts = log_trajectory(scene, 80)[None].repeat(3, 1, 1, 1)
+    rollouts[1, 0, :, :2] = 2 * rollouts[1, 0, :1, :2] - rollouts[1, 0, :, :2]  # as fast as its log, the other way
+    rollouts[2, 1, 40:] = rollouts[2, 1, 39]  # stands from one moment to the next
+    road = outcome_of(scene, rollouts)
+    assert REWARDS["wrong_way"](road)[..., 0].tolist() == [[0, 0], [-1, 0], [0, 0]]
+    assert REWARDS["harsh_jerk"](road)[..., 0].tolist() == [[0, 0], [-1, 0], [0, -1]]
+
+
+def test_passing_closely_costs_both() -> None:
+    scene, ahead = straight_road(2), 0.1 * torch.arange(1, 81)
+    rollouts = log_trajectory(scene, 80)[None].repeat(2, 1, 1, 1)
+    crossed, across = rollouts[1, 0, 39], rollouts[1, 1]  # where the first is after 4 s the second crosses 1.1 s later
+    across[:, 0], across[:, 1], across[:, 3] = crossed[0], crossed[1] + 10 * (ahead - 5.1), math.pi / 2
+    assert REWARDS["close_pass"](outcome_of(scene, rollouts))[..., 0].tolist() == [[0, 0], [-1, -1]]
 
 
 @settings(max_examples=20)
