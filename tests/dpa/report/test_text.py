@@ -86,6 +86,7 @@ def test_safety_has_rates_with_their_differences(runs: Path, text: str) -> None:
         "red light",
         "close pass",
         "harsh jerk",
+        "standing moved",
         "collision",
         "off-road",
     ]
