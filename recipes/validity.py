@@ -112,12 +112,11 @@ def summarise(measured: dict[str, list[dict]]) -> dict[str, dict[str, Any]]:
         distance, score = (
             np.array([[scene[name][key] for scene in row] for row in rows]) for key in ("distance", "realism")
         )
-        half = max(2, (distance.shape[-1] + 1) // 2)
         gain = score - random[..., None]
         relative = distance / np.maximum(distance.mean(-1, keepdims=True), np.finfo(float).tiny)
         found[name] = {
             "correlation": over_scenes(rank_correlation(distance, score), name),
-            "near_half": over_scenes(rank_correlation(distance[..., :half], score[..., :half]), name),
+            "near_half": over_scenes(_near_correlation(rows, name), name),
             "nearest": summary(gain[..., 0]),
             "farthest": summary(gain[..., -1]),
             "distance": [summary(relative[..., place]) for place in range(relative.shape[-1])],
@@ -127,10 +126,11 @@ def summarise(measured: dict[str, list[dict]]) -> dict[str, dict[str, Any]]:
 
 
 def compare_with(measured: dict[str, list[dict]], other: str) -> dict[str, dict[str, Interval]]:
-    """Realism of the ``nearest`` and the ``farthest`` window of each ranking minus another's, scene by scene.
+    """Each ranking minus another one, scene by scene: its correlation ``near_half`` (below 0: it tells realism better),
+    and the realism of its ``nearest`` and its ``farthest`` window.
 
     Raises:
-        ValueError: no scene has realism.
+        ValueError: no scene has realism, or none tells the windows of both apart.
     """
     rows = _with_realism(measured)
     names = [name for name in rows[0][0] if name != "random"]
@@ -141,10 +141,25 @@ def compare_with(measured: dict[str, list[dict]], other: str) -> dict[str, dict[
     def minus_other(name: str, place: int) -> Interval:
         return paired_bootstrap(realism_at(name, place), realism_at(other, place))
 
-    places = {"nearest": 0, "farthest": -1}
+    near = {name: _near_correlation(rows, name) for name in names}
     return {
-        name: {title: minus_other(name, place) for title, place in places.items()} for name in names if name != other
+        name: {
+            "near_half": over_scenes(near[name] - near[other], f"{name} and {other}"),
+            "nearest": minus_other(name, 0),
+            "farthest": minus_other(name, -1),
+        }
+        for name in names
+        if name != other
     }
+
+
+def _near_correlation(rows: list[list[dict]], name: str) -> np.ndarray:
+    """``[policies, scenes]``: Spearman of distance and realism over the nearer half of the windows of a ranking."""
+    distance, score = (
+        np.array([[scene[name][key] for scene in row] for row in rows]) for key in ("distance", "realism")
+    )
+    half = max(2, (distance.shape[-1] + 1) // 2)
+    return rank_correlation(distance[..., :half], score[..., :half])
 
 
 def _with_realism(measured: dict[str, list[dict]]) -> list[list[dict]]:
@@ -217,8 +232,8 @@ def tables(
         ),
         StudyTable(
             "differences",
-            f"realism minus that of {against!r}",
-            ["ranking", "nearest window", "farthest window"],
+            f"minus {against!r}: the correlation, and realism",
+            ["ranking", "Spearman, nearer half", "nearest window", "farthest window"],
             {name: list(values.values()) for name, values in paired.items()},
         ),
     ]

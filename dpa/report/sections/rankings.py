@@ -25,6 +25,7 @@ def validity_section(found: Mapping[str, Any]) -> Section:
     rankings = found["rankings"]
     columns = {"correlation": "Spearman", "near_half": "nearer half", "nearest": "nearest window",
                "farthest": "farthest window"}  # fmt: skip
+    paired = list(columns)[1:]
     parts = [
         element(
             "p",
@@ -40,13 +41,10 @@ def validity_section(found: Mapping[str, Any]) -> Section:
     ]
     if found.get("differences"):
         parts += [
-            element("h3", f"Realism minus that of {found['minus']}"),
+            element("h3", f"The same minus {found['minus']}"),
             table(
-                ["ranking", "nearest window", "farthest window"],
-                [
-                    [name, *(_cell(v[key], found) for key in ("nearest", "farthest"))]
-                    for name, v in found["differences"].items()
-                ],
+                ["ranking", *(columns[key] for key in paired)],
+                [[name, *(_cell(v[key], found) for key in paired)] for name, v in found["differences"].items()],
             ),
         ]
     return Section("validity", "Does the distance tell realism?", joined([*parts, origin("validity", found)]))
