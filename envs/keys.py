@@ -92,6 +92,8 @@ SPREAD: NestedKey = "spread"
 """``[S, A]``: how far apart the rollouts of an agent end, root mean square distance from their mean [m]."""
 REWARDS = "rewards"
 """Under it by name, ``[S, K, A, T]``: what a rollout is paid from each decision on (of methods that follow rewards)."""
+RANKED_IN: NestedKey = "ranked_in"
+"""``[S]``: what ranking and paying a group took, of several the mean [s]."""
 
 # --- what a loss reads ----------------------------------------------------------------------------------------------
 LABELS: NestedKey = "labels"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -18,8 +19,9 @@ from envs.scene import SceneSource
 class RewardRollouts(RankRollouts):
     """Ranks rollouts, pays for them, and keeps the log-probabilities by which their tokens were drawn.
 
-    Writes, beside what :class:`~dpa.ranking.transform.RankRollouts` writes, ``SAMPLE_LOG_PROB``, ``SPREAD`` and, under
-    ``REWARDS``, each reward by its name, ``[S, K, A, T]``, 0 of padding. Reads ``SAMPLING_LOG_PROB`` as well.
+    Writes, beside what :class:`~dpa.ranking.transform.RankRollouts` writes, ``SAMPLE_LOG_PROB``, ``SPREAD``,
+    ``RANKED_IN`` and, under ``REWARDS``, each reward by its name, ``[S, K, A, T]``, 0 of padding. Reads
+    ``SAMPLING_LOG_PROB`` as well.
 
     Args:
         scenes: where the environment's scenes come from.
@@ -42,11 +44,19 @@ class RewardRollouts(RankRollouts):
         self.on_device = False  # rewards are measured beside the scenes, on the CPU
         self.rewards = dict(rewards or {})
         self.in_keys = [*self.in_keys, keys.SAMPLING_LOG_PROB]
-        self.out_keys += [keys.SAMPLE_LOG_PROB, keys.SPREAD, *((keys.REWARDS, name) for name in self.rewards)]
+        self.out_keys += [
+            keys.SAMPLE_LOG_PROB,
+            keys.SPREAD,
+            keys.RANKED_IN,
+            *((keys.REWARDS, name) for name in self.rewards),
+        ]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Rank and pay every group: ``[S * K, T]`` -> ``[S]``."""
+        start = time.perf_counter()
         groups = super().forward(tensordict)
+        each = (time.perf_counter() - start) / len(groups)
+        groups.set(keys.RANKED_IN, torch.full((len(groups),), each, device=groups.device))
         likely = tensordict[keys.SAMPLING_LOG_PROB].unflatten(0, (-1, self.num_rollouts))
         return groups.set(keys.SAMPLE_LOG_PROB, likely.movedim(2, -1))
 

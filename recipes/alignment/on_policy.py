@@ -140,7 +140,7 @@ class OnPolicyStep:
             ``rollout_spread`` [m]; of a policy gradient ``rollout_pair_accuracy``: how often the nearer of a pair of
             them is the likelier one), the rewards
             (``reward_NAME``), the ``staleness`` of their weights [steps], and how long they and what is learnt from
-            them take (``seconds_rollout``, ``seconds_learning``).
+            them take (``seconds_rollout``; of it ``seconds_ranking``, added up over workers; ``seconds_learning``).
         """
         start = time.perf_counter()
         rolled = self._roll_out(step)
@@ -150,6 +150,7 @@ class OnPolicyStep:
             figures = accumulate_gradients(self.loss, parts, self.ranks)
             norm = clip_and_step(self.optimizer, self.options.max_norm, self.schedule)
         took = {"seconds_rollout": before - start, "seconds_learning": time.perf_counter() - before}
+        took["seconds_ranking"] = sum(float(one.ranked[keys.RANKED_IN]) for one in rolled)
         return {**figures, "gradient_norm": norm, **told, **took}
 
     def _roll_out(self, step: int) -> list[Rolled]:

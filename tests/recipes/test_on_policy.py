@@ -36,6 +36,10 @@ def test_it_needs_no_preferences_and_tells_what_it_rolls_out(
     for curve in (*rolled, "seconds_learning", "staleness", "kl", "entropy"):
         values = [value for _, value in read_curve(tmp_path, f"train/{curve}")]
         assert len(values) == 4 and min(values) >= 0, curve
+    seconds = {
+        name: [value for _, value in read_curve(tmp_path, f"train/seconds_{name}")] for name in ("rollout", "ranking")
+    }
+    assert all(0 < part < whole for part, whole in zip(seconds["ranking"], seconds["rollout"], strict=True))
     assert read_curve(tmp_path, "train/kl")[0][1] == pytest.approx(0.0, abs=1e-6) or method == "grpo"
     before, after = load_policy(origin)[0], load_policy(tmp_path / "policy.pt")
     assert after[2]["method"] == method

@@ -34,6 +34,7 @@ HEALTH = {
     "train/rollout_spread": ("Own rollouts: how far apart they end", "spread [m]"),
     "train/rollout_pair_accuracy": ("Own rollouts: pair accuracy", "share of pairs"),
     "train/seconds_rollout": ("Rolling out and ranking", "seconds of a step"),
+    "train/seconds_ranking": ("Ranking, of that; added up over workers", "seconds of a step"),
     "train/seconds_learning": ("Learning from it", "seconds of a step"),
 }
 """Title and axis of the figure of a scalar."""
