@@ -109,14 +109,12 @@ def summarise(measured: dict[str, list[dict]]) -> dict[str, dict[str, Any]]:
     random = np.array([[np.mean(scene["random"]["realism"]) for scene in row] for row in rows])
     found = {}
     for name in names:
-        distance, score = (
-            np.array([[scene[name][key] for scene in row] for row in rows]) for key in ("distance", "realism")
-        )
+        distance, score = _by_window(rows, name, "distance"), _by_window(rows, name, "realism")
         gain = score - random[..., None]
         relative = distance / np.maximum(distance.mean(-1, keepdims=True), np.finfo(float).tiny)
         found[name] = {
             "correlation": over_scenes(rank_correlation(distance, score), name),
-            "near_half": over_scenes(_near_correlation(rows, name), name),
+            "near_half": over_scenes(near_correlation(distance, score), name),
             "nearest": summary(gain[..., 0]),
             "farthest": summary(gain[..., -1]),
             "distance": [summary(relative[..., place]) for place in range(relative.shape[-1])],
@@ -135,31 +133,28 @@ def compare_with(measured: dict[str, list[dict]], other: str) -> dict[str, dict[
     rows = _with_realism(measured)
     names = [name for name in rows[0][0] if name != "random"]
 
-    def realism_at(name: str, place: int) -> np.ndarray:
-        return np.array([[scene[name]["realism"][place] for scene in row] for row in rows])
-
-    def minus_other(name: str, place: int) -> Interval:
-        return paired_bootstrap(realism_at(name, place), realism_at(other, place))
-
-    near = {name: _near_correlation(rows, name) for name in names}
+    score = {name: _by_window(rows, name, "realism") for name in names}
+    near = {name: near_correlation(_by_window(rows, name, "distance"), score[name]) for name in names}
     return {
         name: {
             "near_half": over_scenes(near[name] - near[other], f"{name} and {other}"),
-            "nearest": minus_other(name, 0),
-            "farthest": minus_other(name, -1),
+            "nearest": paired_bootstrap(score[name][..., 0], score[other][..., 0]),
+            "farthest": paired_bootstrap(score[name][..., -1], score[other][..., -1]),
         }
         for name in names
         if name != other
     }
 
 
-def _near_correlation(rows: list[list[dict]], name: str) -> np.ndarray:
-    """``[policies, scenes]``: Spearman of distance and realism over the nearer half of the windows of a ranking."""
-    distance, score = (
-        np.array([[scene[name][key] for scene in row] for row in rows]) for key in ("distance", "realism")
-    )
+def near_correlation(distance: np.ndarray, score: np.ndarray) -> np.ndarray:
+    """Spearman of distance and realism over the nearer half of the windows: ``[..., windows]`` -> ``[...]``."""
     half = max(2, (distance.shape[-1] + 1) // 2)
     return rank_correlation(distance[..., :half], score[..., :half])
+
+
+def _by_window(rows: list[list[dict]], name: str, key: str) -> np.ndarray:
+    """``[policies, scenes, windows]`` of a ranking."""
+    return np.array([[scene[name][key] for scene in row] for row in rows])
 
 
 def _with_realism(measured: dict[str, list[dict]]) -> list[list[dict]]:
@@ -232,7 +227,7 @@ def tables(
         ),
         StudyTable(
             "differences",
-            f"minus {against!r}: the correlation, and realism",
+            f"the correlation, and realism, minus that of {against!r}",
             ["ranking", "Spearman, nearer half", "nearest window", "farthest window"],
             {name: list(values.values()) for name, values in paired.items()},
         ),

@@ -19,6 +19,7 @@ from unittest import mock
 import pytest
 import torch
 
+from dpa.training.checkpoint import load_policy
 from envs.sources.synthetic import straight_road
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -146,6 +147,23 @@ def kill_when() -> Callable[..., None]:
         assert process.returncode == -signal.SIGKILL, "it had finished already; give it more to do"
 
     return start_and_kill
+
+
+@pytest.fixture(scope="session")
+def align_with_a_kill(run: Callable, kill_when: Callable) -> Callable[..., None]:
+    """Aligns to the end, and again with a kill in between: both must end with the same weights."""
+
+    def align_twice(arguments: Callable[[Path], list[str]], folder: Path, checkpoint: int) -> None:
+        whole, killed = folder / "whole", folder / "killed"
+        assert run("align", *arguments(whole)).status == 0
+        kill_when((killed / f"checkpoints/step_{checkpoint:010d}.pt").exists, "align", *arguments(killed))
+        assert not (killed / "policy.pt").exists()
+        assert run("align", *arguments(killed)).status == 0
+        mine, other = (load_policy(each / "policy.pt")[0] for each in (killed, whole))
+        for name, value in other.items():
+            assert torch.equal(mine[name], value), name
+
+    return align_twice
 
 
 @pytest.fixture(autouse=True)

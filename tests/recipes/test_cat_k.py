@@ -33,16 +33,9 @@ def test_it_learns_from_logs_and_tells_how_well_they_are_followed(
 
 @pytest.mark.slow
 def test_a_run_that_is_cut_goes_on_to_the_same_weights(
-    run: Callable, options: Callable, kill_when: Callable, origin: Path, tmp_path: Path
+    options: Callable, align_with_a_kill: Callable, origin: Path, tmp_path: Path
 ) -> None:
-    many = ("alignment.steps=30",)
-    assert run("align", *aligning(options, origin, tmp_path / "whole", *many)).status == 0
-    killed = aligning(options, origin, tmp_path / "killed", *many)
-    kill_when((tmp_path / "killed/checkpoints/step_0000000004.pt").exists, "align", *killed)
-    assert not (tmp_path / "killed/policy.pt").exists()
-    assert run("align", *killed).status == 0
-    mine, whole = (load_policy(tmp_path / name / "policy.pt")[0] for name in ("killed", "whole"))
-    assert all(torch.equal(mine[name], value) for name, value in whole.items())
+    align_with_a_kill(lambda output: aligning(options, origin, output, "alignment.steps=30"), tmp_path, checkpoint=4)
 
 
 def test_more_rows_in_a_pass_change_rounding_alone(

@@ -71,18 +71,12 @@ def test_killed_training(
 
 @pytest.mark.parametrize("method", ["dpa_adef", "sft_best_oa", "adversarial_afd", "kto", "listwise"])
 def test_killed_alignment_of_other_kinds(
-    run: Callable, options: Callable, kill_when: Callable, runs: Path, tmp_path: Path, method: str
+    options: Callable, align_with_a_kill: Callable, runs: Path, tmp_path: Path, method: str
 ) -> None:
     """What a step draws from a store differs by kind: pairs, the nearest, logs, sets, a ranking."""
-    where = [f"policy={runs / 'pretrain/policy.pt'}", f"preferences={runs / 'collect'}", f"method={method}"]
-    given = options("align", "alignment.steps=60", "alignment.checkpoint_interval=5", *where)
-    given += ["alignment.pairs_per_scene=2"]
-    assert run("align", *given, f"output={tmp_path / 'whole'}").status == 0
-    killed = [*given, f"output={tmp_path / 'killed'}"]
-    kill_when((tmp_path / "killed/checkpoints/step_0000000005.pt").exists, "align", *killed)
-    assert not (tmp_path / "killed/policy.pt").exists()
-    assert run("align", *killed).status == 0
-    assert_same_policy(tmp_path / "killed", tmp_path / "whole")
+    given = [f"policy={runs / 'pretrain/policy.pt'}", f"preferences={runs / 'collect'}", f"method={method}"]
+    given += ["alignment.steps=60", "alignment.checkpoint_interval=5", "alignment.pairs_per_scene=2"]
+    align_with_a_kill(lambda output: options("align", *given, f"output={output}"), tmp_path, checkpoint=5)
 
 
 def contents(folder: Path) -> dict[int, dict[str, torch.Tensor]]:

@@ -112,15 +112,12 @@ def test_pairs_of_its_own_may_be_ranked_by_another_distance(
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_a_run_that_is_cut_goes_on_to_the_same_weights(
-    run: Callable, options: Callable, kill_when: Callable, origin: Path, tmp_path: Path, method: str
+    options: Callable, align_with_a_kill: Callable, origin: Path, tmp_path: Path, method: str
 ) -> None:
-    many = ("alignment.steps=30",)
-    assert run("align", *aligning(options, origin, method, tmp_path / "whole", *many)).status == 0
-    killed = aligning(options, origin, method, tmp_path / "killed", *many)
-    kill_when((tmp_path / "killed/checkpoints/step_0000000004.pt").exists, "align", *killed)
-    assert not (tmp_path / "killed/policy.pt").exists()
-    assert run("align", *killed).status == 0
-    assert_same(tmp_path / "killed", tmp_path / "whole")
+    def arguments(output: Path) -> list[str]:
+        return aligning(options, origin, method, output, "alignment.steps=30")
+
+    align_with_a_kill(arguments, tmp_path, checkpoint=4)
 
 
 @pytest.mark.slow
