@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 
 from dpa.report.canvas import CYCLE, INK, QUIET, VERDICTS, blank_figure, calm, save_figure
 from dpa.report.experiment import Experiment, decoding_of, in_words
@@ -62,6 +63,7 @@ def _forest(axes: Axes, records: list[dict[str, Any]]) -> None:
             bbox={"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none"},
         )  # fmt: skip
     axes.margins(x=0.15)  # room for the letters of the outermost intervals
+    axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
     axes.set_title("realism minus the reference's, 95 % interval")
 
 
