@@ -70,7 +70,8 @@ def compare(cfg: DictConfig) -> dict[str, Any]:
                 adopt_policies(cfg, stages)
             chosen = choose(cfg, stages)
             measure(cfg, stages, chosen)
-        found = summarise_experiment(cfg, splits, chosen, stages) | made_by(cfg, stages) | {"command": made["command"]}
+        counted = splits.sizes() | {"source": cfg.scenes.source}
+        found = summarise_experiment(cfg, counted, chosen, stages) | made_by(cfg, stages) | {"command": made["command"]}
         path, pictures = runs.experiment(cfg.experiment.name), {}
         write_json(path, found)
         if cfg.pictures.scenes:

@@ -40,6 +40,7 @@ from recipes.benchmark.__main__ import make_parser as benchmark_parser
 from recipes.common.models import TOKENIZERS
 from recipes.difference import make_parser as difference_parser
 from recipes.experiment.methods import kept
+from recipes.merge import make_parser as merge_parser
 from recipes.plan import make_parser as plan_parser
 from recipes.report import make_parser as report_parser
 from recipes.studies import spurious
@@ -147,7 +148,7 @@ def extra_configurations(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-PLAIN = ("recipes.benchmark", "recipes.difference", "recipes.plan", "recipes.report", "recipes.zoo")
+PLAIN = ("recipes.benchmark", "recipes.difference", "recipes.merge", "recipes.plan", "recipes.report", "recipes.zoo")
 """Recipes whose arguments are no options of a configuration."""
 BENCHMARKS = [command for command in COMMANDS if command.startswith("recipes.benchmark ")]
 
@@ -170,6 +171,11 @@ def test_a_plan_takes_the_options_that_a_command_gives(command: str) -> None:
 @pytest.mark.parametrize("command", [command for command in COMMANDS if command.startswith("recipes.difference ")])
 def test_a_difference_takes_the_arguments_that_a_command_gives(command: str) -> None:
     assert difference_parser().parse_args(shlex.split(command)[1:]).experiment
+
+
+@pytest.mark.parametrize("command", [command for command in COMMANDS if command.startswith("recipes.merge ")])
+def test_a_merge_takes_the_arguments_that_a_command_gives(command: str) -> None:
+    assert len(merge_parser().parse_args(shlex.split(command)[1:]).parts) > 1
 
 
 @pytest.mark.parametrize("command", [command for command in COMMANDS if command.startswith("recipes.report ")])

@@ -119,7 +119,7 @@ class Experiment:
         versions: of packages.
         machine: it ran on.
         date: it was finished.
-        command: that makes it.
+        command: that makes it; of one that was put together those of its parts as well, each in a line.
     """
 
     path: Path

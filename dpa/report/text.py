@@ -46,7 +46,7 @@ def _experiment(experiment: Experiment, evaluations: Evaluations) -> Iterator[st
     repeats = f" ({experiment.paper} of the paper)" if experiment.paper else ""
     yield f"## {experiment.title}"
     yield f"{experiment.question}{repeats}"
-    yield f"    {experiment.command}"
+    yield "\n".join(f"    {line}" for line in experiment.command.splitlines())
     yield _made(experiment)
     yield headline(experiment)
     compared = experiment.comparisons()

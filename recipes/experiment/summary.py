@@ -17,7 +17,6 @@ from recipes.alignment.data import ON_POLICY, RANKED, ROLLED, num_candidates
 from recipes.alignment.draws import num_drawn
 from recipes.alignment.likelihoods import PROBED
 from recipes.common.cli import mean_known, plain
-from recipes.common.scenes import Splits
 from recipes.evaluate import SCENE_FIGURES
 from recipes.experiment.jobs import runs_of, trained_in
 from recipes.experiment.methods import behind, setup_of
@@ -132,7 +131,7 @@ class Results:
         return read_json(self.runs.evaluation(seed, run, self.split))["per_scene"]["realism"]
 
 
-def summarise_experiment(cfg: DictConfig, splits: Splits, chosen: Chosen, stages: Stages) -> dict[str, Any]:
+def summarise_experiment(cfg: DictConfig, scenes: Mapping[str, Any], chosen: Chosen, stages: Stages) -> dict[str, Any]:
     """The content of ``experiments/<name>.json``.
 
     ``rows`` and ``paired`` compare at the common decoding, and show the reference at the others of the grid beside
@@ -142,7 +141,7 @@ def summarise_experiment(cfg: DictConfig, splits: Splits, chosen: Chosen, stages
 
     Args:
         cfg: of the experiment.
-        splits: scenes.
+        scenes: number of each split, and ``source``.
         chosen: what stands for each method, the reference first.
         stages: that were run, with their account.
     """
@@ -158,7 +157,7 @@ def summarise_experiment(cfg: DictConfig, splits: Splits, chosen: Chosen, stages
     return {name: experiment[name] for name in TOLD} | {
         "versus": standard,
         "metric": str(cfg.evaluation.metric),
-        "scenes": {**splits.sizes(), "source": cfg.scenes.source},
+        "scenes": dict(scenes),
         "seeds": list(cfg.seeds),
         "methods": methods,
         "labels": labels(cfg, methods),

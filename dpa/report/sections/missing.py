@@ -18,13 +18,15 @@ OF_ALL = "experiment.checkpoints="
 
 
 def missing_section(study: Study, experiments: Iterable[str]) -> Section | None:
-    """Names of what the folder lacks; None where it lacks nothing.
+    """Names of what the folder lacks; None where it lacks nothing, or was put together from parts.
 
     Args:
         study: of the page.
         experiments: names of all that ``recipes.compare`` knows.
     """
     folder = study.folder
+    if study.main is not None and len(study.main.command.splitlines()) > 1:  # its policies are where its parts are
+        return None
     options = _options(study)
     lacking = {
         f"experiment {name}": shlex.join(["python", "-m", "recipes.compare", f"experiment={name}", *options])

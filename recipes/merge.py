@@ -1,0 +1,349 @@
+"""Parts of an experiment that ran apart, put together: other seeds on other machines, or methods that came later.
+
+    python -m recipes.merge OUT PART PART ...
+
+PART is the folder that recipes.compare fills (its output), or an archive of one (recipes.report RUNS part.zip). OUT is
+a new folder as an archive unpacks to: results of every scene, options and curves, without weights, scenes and rollouts.
+Every method must be there for every seed. Nothing is run: differences and intervals are computed again from the values
+of all scenes. Where parts differ in what may differ (title, grid of decodings, the decoding that stands for a method)
+the first one that has it decides, so that no decoding is chosen by what came later.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+import tempfile
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from omegaconf import DictConfig, OmegaConf
+
+from dpa.models import Decoding
+from dpa.report.archive import files_of
+from dpa.report.cards import KEPT, read_preference_cards
+from dpa.report.experiment import Experiment, decoding_of, read_experiment, read_json
+from dpa.report.table import REFERENCE
+from envs.files import write_json
+from envs.options import differences
+from recipes.common.cli import refused
+from recipes.common.provenance import provenance
+from recipes.compare import adopt_policies, made_by, measure, train_policies
+from recipes.experiment.jobs import evaluate_job, runs_of
+from recipes.experiment.logged import log_experiment
+from recipes.experiment.pool import Job
+from recipes.experiment.runs import SNAPSHOT, Run, RunFolder
+from recipes.experiment.stages import Stages, read_account
+from recipes.experiment.summary import Chosen, summarise_experiment
+
+METHODS = ("methods", "rankings", "experiment.setup", "experiment.labels", "experiment.published")
+"""Options by method or by ranking: parts agree in those that they share."""
+APART = (
+    "seeds", "reference", "trained", "output", "only", "scenes", "threads", "workers", "device", "logger", "pictures",
+    "decoding.grid", "experiment.name", "experiment.title", "experiment.question", "experiment.paper",
+    "experiment.headline", "experiment.versus", "experiment.axis", "alignment.snapshots", "alignment.workers",
+    "alignment.memory", "alignment.max_rows", "alignment.checkpoint_interval", "collection.memory", "evaluation.memory",
+)  # fmt: skip
+"""Options that parts may differ in; what their scenes are is told by the cards of them."""
+
+
+class Part(NamedTuple):
+    """What ran apart.
+
+    Attributes:
+        name: as it was given.
+        runs: its folder.
+        found: by its experiment.
+    """
+
+    name: Path
+    runs: RunFolder
+    found: Experiment
+
+
+class Recorded:
+    """Stands for workers where all work is done: every job must be in the account.
+
+    Args:
+        account: ``{stage: {job: seconds}}``.
+    """
+
+    def __init__(self, account: Mapping[str, Mapping[str, float]]) -> None:
+        self.account = account
+
+    def run(self, jobs: Sequence[Job], name: str) -> Iterator[tuple[str, float, dict[str, float]]]:
+        """Name of each job, and the other stages that it spent time on."""
+        for job in jobs:
+            stages = [stage for stage, done in self.account.items() if job.name in done]
+            if name not in stages:
+                raise ValueError(f"no part has done {job.name!r} ({name}); each needs every method for all its seeds.")
+            yield job.name, 0.0, {stage: 0.0 for stage in stages if stage != name}
+
+
+def merge(out: Path, parts: Sequence[Path], name: str | None = None, trained: Path | None = None) -> Path:
+    """Put an experiment together.
+
+    Args:
+        out: new folder.
+        parts: folders or archives; which comes first is told above.
+        name: of the experiment in each part; by default the only one that is there.
+        trained: where the same parts of the trainings were put together, for parts whose policies were trained
+            elsewhere.
+
+    Returns:
+        ``experiments/<name>.json`` of ``out``.
+
+    Raises:
+        ValueError: parts of other scenes, options or policies; a seed or a method that a part lacks; ``out`` holds
+            something. Nothing is left then.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ValueError(f"{out} is there already; name a new folder, or remove it.")
+    with _opened(parts, name) as opened, _made_whole(out):
+        _check_alike(opened)
+        cfg = merged_config(opened, out, trained)
+        runs = runs_of(cfg)
+        _gather(opened, runs)
+        stages = Stages(Recorded(read_account(runs.stages)), runs.stages, provenance("merge", "cpu"))
+        chosen, tuning = chosen_first(opened), _tuning(opened)
+        _check_whole(cfg, chosen)
+        (train_policies if cfg.trained is None else adopt_policies)(cfg, stages)
+        tried = dict.fromkeys((row["seed"], policy_of(row), "tune", *decoding_of(row)) for row in tuning)
+        stages.run("tune", evaluate_job, cfg, list(tried))
+        measure(cfg, stages, chosen)
+        found = summarise_experiment(cfg, opened[0].found.scenes, chosen, stages) | made_by(cfg, stages)
+        commands = dict.fromkeys(part.found.command for part in opened)
+        command = "\n".join([*commands, provenance("merge", "cpu")["command"]])
+        write_json(runs.experiment(cfg.experiment.name), found | {"tuning": tuning, "command": command})
+        log_experiment(cfg, read_experiment(runs.experiment(cfg.experiment.name)), {})
+    return runs.experiment(cfg.experiment.name)
+
+
+def merged_config(parts: Sequence[Part], output: Path, trained: Path | None) -> DictConfig:
+    """Options of the whole: those of the first part, with all seeds, references and methods.
+
+    Raises:
+        ValueError: parts whose policies were trained elsewhere without ``trained``, or the other way round.
+    """
+    elsewhere = {part.found.config["trained"] for part in parts} - {None}
+    if elsewhere and trained is None:
+        raise ValueError(
+            f"the policies were trained in {', '.join(sorted(elsewhere))}; put those together first and say --trained."
+        )
+    if trained is not None and not elsewhere:
+        raise ValueError(f"--trained {trained}: these parts have trained their policies themselves; leave it out.")
+    cfg = OmegaConf.create(dict(parts[0].found.config))
+    for each in METHODS:
+        sections = [OmegaConf.select(OmegaConf.create(dict(part.found.config)), each) for part in reversed(parts)]
+        OmegaConf.update(cfg, each, OmegaConf.merge(*sections), merge=False)
+    order = dict.fromkeys(method for part in parts for method in part.found.config["methods"])
+    cfg.methods = {method: cfg.methods[method] for method in order}
+    starts = {seed: start for part in reversed(parts) for seed, start in _references(part).items()}
+    cfg.seeds = sorted(starts)
+    cfg.reference = None if None in starts.values() else [starts[seed] for seed in cfg.seeds]
+    cfg.output, cfg.trained = str(output), None if trained is None else str(trained)
+    return cfg
+
+
+def _references(part: Part) -> dict[int, str | None]:
+    """What each seed starts from; None where it trains that itself."""
+    given, seeds = part.found.config["reference"], part.found.seeds
+    return dict(zip(seeds, given, strict=True)) if isinstance(given, list) else dict.fromkeys(seeds, given)
+
+
+def chosen_first(parts: Sequence[Part]) -> Chosen:
+    """What stands for each method in the first part that has it."""
+    common: dict[str, Run] = {}
+    best: dict[str, Run] = {}
+    for part in parts:
+        at_common = [row for row in part.found.at_common.rows if decoding_of(row) == part.found.common]
+        for rows, runs in ((at_common, common), (part.found.own_best.rows, best)):
+            for row in rows:
+                runs.setdefault(row["method"], Run(policy_of(row), Decoding(*decoding_of(row))))
+    return Chosen(common=common, best=best, tuned=frozenset())
+
+
+def policy_of(row: Mapping[str, Any]) -> str:
+    """The policy of a row: its method, or the snapshot that its file is of.
+
+    Examples:
+        >>> policy_of({"file": "seed_0/dpa_omf/step_60/eval_top_p_1_t_1.json"})
+        'dpa_omf@60'
+    """
+    _, method, *steps, _ = Path(row["file"]).parts
+    return SNAPSHOT.join([method, *(step.removeprefix("step_") for step in steps)])
+
+
+def _tuning(parts: Sequence[Part]) -> list[Mapping[str, Any]]:
+    """Rows of the tuning scenes, each once, in the order of tables."""
+    rows = {row["file"]: row for part in reversed(parts) for row in part.found.tuning}.values()
+    methods = list(dict.fromkeys(method for part in parts for method in part.found.methods))
+    tried = list(dict.fromkeys(decoding_of(row) for part in parts for row in part.found.tuning))
+    return sorted(rows, key=lambda row: (methods.index(row["method"]), tried.index(decoding_of(row)), row["seed"]))
+
+
+@contextmanager
+def _opened(given: Sequence[Path], name: str | None) -> Iterator[list[Part]]:
+    """The parts, archives unpacked for as long as the block runs."""
+    with tempfile.TemporaryDirectory() as unpacked:
+        parts = []
+        for place, path in enumerate(given):
+            folder = path
+            if path.is_file():
+                folder = Path(unpacked, str(place))
+                if not zipfile.is_zipfile(path):
+                    raise ValueError(f"{path} is no archive; name a folder of results, or a .zip of recipes.report.")
+                with zipfile.ZipFile(path) as archive:
+                    archive.extractall(folder)
+            parts.append(Part(path, RunFolder(folder), _experiment(path, folder, name)))
+        yield parts
+
+
+def _experiment(path: Path, folder: Path, name: str | None) -> Experiment:
+    there = sorted(each.stem for each in (folder / "experiments").glob("*.json"))
+    if not there:
+        raise ValueError(f"{path} holds no experiments/*.json; name the output of a recipes.compare that has finished.")
+    if (name is None and len(there) > 1) or name not in (None, *there):
+        raise ValueError(f"{path} has the experiments {', '.join(there)}; say --experiment with one of them.")
+    return read_experiment(RunFolder(folder).experiment(name or there[0]))
+
+
+@contextmanager
+def _made_whole(out: Path) -> Iterator[None]:
+    """A new folder, which goes again if the block fails."""
+    out.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        shutil.rmtree(out)
+        raise
+
+
+def _check_alike(parts: Sequence[Part]) -> None:
+    """Same scenes, same options beside :data:`APART`, and same options of what the parts share by name."""
+    first = parts[0]
+    for part in parts[1:]:
+        both = f"{part.name} and {first.name} cannot be put together"
+        theirs, ours = (read_json(each.runs.scenes)["options"] for each in (first, part))
+        if differ := differences(theirs, ours):
+            raise ValueError(f"{both}: they are of other scenes ({differ}).")
+        if (first.found.metric, first.found.split) != (part.found.metric, part.found.split):
+            raise ValueError(f"{both}: they report another metric or split.")
+        if differ := differences(_shared(first.found.config), _shared(part.found.config)):
+            raise ValueError(f"{both}: they ran with other options ({differ}).")
+    for place, part in enumerate(parts):
+        for earlier in parts[:place]:
+            for each in METHODS:
+                theirs, ours = (_select(side.found.config, each) for side in (earlier, part))
+                both = theirs.keys() & ours.keys()
+                if differ := differences(*({name: side[name] for name in both} for side in (theirs, ours))):
+                    raise ValueError(f"{each} differs between {earlier.name} and {part.name}: {differ}.")
+
+
+def _shared(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Options that all parts must have alike."""
+    kept = OmegaConf.create(dict(config))
+    for name in (*APART, *METHODS):
+        section, _, key = name.rpartition(".")
+        (OmegaConf.select(kept, section) if section else kept).pop(key, None)
+    return OmegaConf.to_container(kept)
+
+
+def _select(config: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    for key in name.split("."):
+        config = config[key]
+    return config
+
+
+def _gather(parts: Sequence[Part], runs: RunFolder) -> None:
+    """Results of all parts in one folder, with one account of what they took and one of what made them.
+
+    Raises:
+        ValueError: two parts have a result of the same name by another policy, other scenes or other options.
+    """
+    account: dict[str, dict[str, float]] = {}
+    origins: dict[str, Any] = {"made": [], "jobs": {}}
+    cards: dict[str, Any] = {}
+    for part in parts:
+        for file in files_of(part.runs.root):
+            relative = file.relative_to(part.runs.root)
+            if relative.parts[0].startswith("seed_"):
+                _take(file, runs.root / relative, part)
+        cards = {name: card.to_json() for name, card in read_preference_cards(part.runs.root).items()} | cards
+        theirs = read_json(part.runs.stages.with_name("origins.json"))
+        origins["made"] += [each for each in theirs["made"] if each not in origins["made"]]
+        for stage, jobs in read_account(part.runs.stages).items():
+            kept, signed = account.setdefault(stage, {}), origins["jobs"].setdefault(stage, {})
+            for job in jobs.keys() - kept.keys():
+                kept[job] = jobs[job]
+                signed[job] = origins["made"].index(theirs["made"][theirs["jobs"][stage][job]])
+    shutil.copyfile(parts[0].runs.scenes, runs.scenes)
+    write_json(runs.stages, account)
+    write_json(runs.stages.with_name("origins.json"), origins)
+    write_json(runs.root / KEPT, cards)
+
+
+def _take(file: Path, place: Path, part: Part) -> None:
+    """Copy a result, or find it there alike: made with the same options from the same weights and scenes."""
+    if not place.is_file():
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, place)
+        return
+    if file.suffix != ".json":
+        return
+    theirs, ours = (content.get("options", {}) for content in map(read_json, (place, file)))
+    if differ := differences(theirs, ours):
+        raise ValueError(
+            f"{part.name}: {file.relative_to(part.runs.root)} is in an earlier part with other options ({differ}); "
+            "leave this seed or this method out of one of the two."
+        )
+
+
+def _check_whole(cfg: DictConfig, chosen: Chosen) -> None:
+    """Every result that the tables are made of is there, of scenes that are called alike."""
+    runs, split, called = runs_of(cfg), cfg.experiment.split, {}
+    grid = {Run(REFERENCE, Decoding(*each)) for each in cfg.decoding.grid}
+    for seed in cfg.seeds:
+        needed = [runs.evaluation(seed, run, split) for run in {*chosen.common.values(), *chosen.best.values(), *grid}]
+        needed += [runs.likelihood(seed, run.policy, split) for run in chosen.best.values()]
+        for path in sorted(needed):
+            if not path.is_file():
+                raise ValueError(
+                    f"no part has {runs.relative(path)}; each method must be there for each seed, with the snapshot "
+                    "and at the decoding that the first part that has it chose."
+                )
+            called.setdefault(tuple(read_json(path)["scenes"]), path)
+    if len(called) > 1:
+        one, other = (runs.relative(path) for path in list(called.values())[:2])
+        raise ValueError(f"{one} and {other} call their scenes by other names; number scenes in all parts or in none.")
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Arguments of the command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m recipes.merge", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("out", metavar="OUT", type=Path, help="new folder")
+    parser.add_argument("parts", metavar="PART", type=Path, nargs="+", help="folder of results, or an archive of one")
+    parser.add_argument("--experiment", metavar="NAME", help="in parts that have several")
+    parser.add_argument(
+        "--trained", metavar="RUNS", type=Path, help="where the trainings of these parts were put together"
+    )
+    return parser
+
+
+def main() -> None:
+    """Entry point of ``python -m recipes.merge``."""
+    given = make_parser().parse_args()
+    try:
+        print(merge(given.out, given.parts, given.experiment, given.trained))
+    except (ValueError, OSError) as error:
+        sys.exit(refused(error))
+
+
+if __name__ == "__main__":
+    main()
