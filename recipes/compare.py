@@ -15,6 +15,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Sequence
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import hydra
@@ -45,9 +46,9 @@ from recipes.experiment.logged import log_experiment
 from recipes.experiment.methods import checkpoints_of, kept, levels, policies_of, read_setups
 from recipes.experiment.pictures import write_players
 from recipes.experiment.pool import Workers
-from recipes.experiment.runs import Run
+from recipes.experiment.runs import Run, RunFolder
 from recipes.experiment.stages import Stages, alone_in
-from recipes.experiment.summary import Chosen, summarise_experiment
+from recipes.experiment.summary import Chosen, chosen_in, summarise_experiment
 from recipes.report import report
 
 
@@ -112,9 +113,14 @@ def train_policies(cfg: DictConfig, stages: Stages) -> None:
 def choose(cfg: DictConfig, stages: Stages) -> Chosen:
     """Checkpoint and decoding of each method, both at once, by mean realism over seeds on the tuning scenes.
 
-    What has one checkpoint and one decoding needs no choice, and is not rolled out for it.
+    What has one checkpoint and one decoding needs no choice, and is not rolled out for it; nothing is where another
+    folder has chosen.
     """
     policies = checkpoints_of(cfg)
+    if cfg.decoding.chosen is not None:
+        theirs = chosen_in(read_experiment(RunFolder(Path(cfg.decoding.chosen)).experiment(cfg.experiment.name)))
+        common, best = ({method: runs[method] for method in policies} for runs in (theirs.common, theirs.best))
+        return Chosen(common=common, best=best, tuned=frozenset())
     runs = {method: [Run(*each) for each in product(among, decodings(cfg))] for method, among in policies.items()}
     tuned = {run for among in runs.values() if len(among) > 1 for run in among}
     stages.run("tune", evaluate_job, cfg, jobs_of(cfg, tuned, "tune"))

@@ -36,17 +36,18 @@ from recipes.compare import adopt_policies, made_by, measure, train_policies
 from recipes.experiment.jobs import evaluate_job, runs_of
 from recipes.experiment.logged import log_experiment
 from recipes.experiment.pool import Job
-from recipes.experiment.runs import SNAPSHOT, Run, RunFolder
+from recipes.experiment.runs import Run, RunFolder
 from recipes.experiment.stages import Stages, read_account
-from recipes.experiment.summary import Chosen, summarise_experiment
+from recipes.experiment.summary import Chosen, chosen_in, policy_of, summarise_experiment
 
 METHODS = ("methods", "rankings", "experiment.setup", "experiment.labels", "experiment.published")
 """Options by method or by ranking: parts agree in those that they share."""
 APART = (
     "seeds", "reference", "trained", "output", "only", "scenes", "threads", "workers", "device", "logger", "pictures",
-    "decoding.grid", "experiment.name", "experiment.title", "experiment.question", "experiment.paper",
-    "experiment.headline", "experiment.versus", "experiment.axis", "alignment.snapshots", "alignment.workers",
-    "alignment.memory", "alignment.max_rows", "alignment.checkpoint_interval", "collection.memory", "evaluation.memory",
+    "decoding.grid", "decoding.chosen", "alignment.snapshots", "alignment.workers", "alignment.memory",
+    "alignment.max_rows", "alignment.checkpoint_interval", "collection.memory", "evaluation.memory",
+    "experiment.name", "experiment.title", "experiment.question", "experiment.paper", "experiment.headline",
+    "experiment.versus", "experiment.axis",
 )  # fmt: skip
 """Options that parts may differ in; what their scenes are is told by the cards of them."""
 
@@ -159,23 +160,10 @@ def chosen_first(parts: Sequence[Part]) -> Chosen:
     """What stands for each method in the first part that has it."""
     common: dict[str, Run] = {}
     best: dict[str, Run] = {}
-    for part in parts:
-        at_common = [row for row in part.found.at_common.rows if decoding_of(row) == part.found.common]
-        for rows, runs in ((at_common, common), (part.found.own_best.rows, best)):
-            for row in rows:
-                runs.setdefault(row["method"], Run(policy_of(row), Decoding(*decoding_of(row))))
+    for chosen in (chosen_in(part.found) for part in parts):
+        common |= {method: run for method, run in chosen.common.items() if method not in common}
+        best |= {method: run for method, run in chosen.best.items() if method not in best}
     return Chosen(common=common, best=best, tuned=frozenset())
-
-
-def policy_of(row: Mapping[str, Any]) -> str:
-    """The policy of a row: its method, or the snapshot that its file is of.
-
-    Examples:
-        >>> policy_of({"file": "seed_0/dpa_omf/step_60/eval_top_p_1_t_1.json"})
-        'dpa_omf@60'
-    """
-    _, method, *steps, _ = Path(row["file"]).parts
-    return SNAPSHOT.join([method, *(step.removeprefix("step_") for step in steps)])
 
 
 def _tuning(parts: Sequence[Part]) -> list[Mapping[str, Any]]:
@@ -314,7 +302,7 @@ def _check_whole(cfg: DictConfig, chosen: Chosen) -> None:
             if not path.is_file():
                 raise ValueError(
                     f"no part has {runs.relative(path)}; each method must be there for each seed, with the snapshot "
-                    "and at the decoding that the first part that has it chose."
+                    "and at the decoding that the first part that has it chose (decoding.chosen)."
                 )
             called.setdefault(tuple(read_json(path)["scenes"]), path)
     if len(called) > 1:

@@ -27,8 +27,9 @@ from recipes.common.limits import GROUPS, check_limits, is_number
 from recipes.common.models import build_policy
 from recipes.common.rankings import build_distance, ranking_options
 from recipes.experiment.jobs import check_made_alike, compared_policy, reference_of, trained_in
-from recipes.experiment.methods import policies_of, read_setups
-from recipes.experiment.summary import labels
+from recipes.experiment.methods import checkpoints_of, policies_of, read_setups
+from recipes.experiment.runs import RunFolder
+from recipes.experiment.summary import chosen_in, labels
 
 CHECKPOINTS = ("last", "select", "all")
 """What becomes of the snapshots of an alignment: there are none, one of them may be chosen, or each is shown."""
@@ -138,6 +139,33 @@ def _check_decodings(cfg: DictConfig) -> None:
         raise ValueError(f"decoding.grid has {twice[0]} more than once, got {told}; name each decoding once.")
     if list(cfg.decoding.common) not in [list(each) for each in cfg.decoding.grid]:
         raise ValueError(f"decoding.common={list(cfg.decoding.common)} must be one of decoding.grid.")
+    if cfg.decoding.chosen is not None:
+        _check_chosen(cfg)
+
+
+def _check_chosen(cfg: DictConfig) -> None:
+    """The folder that chose has finished this experiment, with these methods, snapshots and common decoding."""
+    told, name = f"decoding.chosen={cfg.decoding.chosen}", cfg.experiment.name
+    path = RunFolder(Path(cfg.decoding.chosen)).experiment(name)
+    if not path.is_file():
+        raise ValueError(
+            f"{told} has no finished experiment {name!r}; run it there first, or say decoding.chosen=null."
+        )
+    found = read_experiment(path)
+    if list(found.common) != list(cfg.decoding.common):
+        raise ValueError(
+            f"{told} compares at {list(found.common)}; say decoding.common={list(found.common)} here, or choose anew."
+        )
+    theirs = chosen_in(found)
+    for method, among in checkpoints_of(cfg).items():
+        if method not in theirs.best:
+            raise ValueError(f"{told} has chosen nothing for {method}; it has {', '.join(theirs.best)} (only).")
+        for run in (theirs.common[method], theirs.best[method]):
+            if run.policy not in among:
+                raise ValueError(
+                    f"{told} has chosen {run.policy}, which is none of {', '.join(among)}; have the same "
+                    "alignment.snapshots and experiment.checkpoints."
+                )
 
 
 def _check_rankings(cfg: DictConfig) -> None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import compress
+from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
 from omegaconf import DictConfig
 
 from dpa.models import Decoding
-from dpa.report.experiment import read_json
+from dpa.report.experiment import Experiment, decoding_of, read_json
 from dpa.report.statistics import compare_methods
 from dpa.report.table import REFERENCE
 from recipes.alignment.data import ON_POLICY, RANKED, ROLLED, num_candidates
@@ -39,6 +40,27 @@ class Chosen(NamedTuple):
     common: dict[str, Run]
     best: dict[str, Run]
     tuned: frozenset[Run]
+
+
+def chosen_in(found: Experiment) -> Chosen:
+    """What a finished experiment has chosen; here nothing is rolled out for it."""
+    at_common = [row for row in found.at_common.rows if decoding_of(row) == found.common]
+    common, best = (
+        {row["method"]: Run(policy_of(row), Decoding(*decoding_of(row))) for row in rows}
+        for rows in (at_common, found.own_best.rows)
+    )
+    return Chosen(common=common, best=best, tuned=frozenset())
+
+
+def policy_of(row: Mapping[str, Any]) -> str:
+    """The policy of a row: its method, or the snapshot that its file is of.
+
+    Examples:
+        >>> policy_of({"file": "seed_0/dpa_omf/step_60/eval_top_p_1_t_1.json"})
+        'dpa_omf@60'
+    """
+    _, method, *steps, _ = Path(row["file"]).parts
+    return SNAPSHOT.join([method, *(step.removeprefix("step_") for step in steps)])
 
 
 Shown = tuple[str, Run]

@@ -146,6 +146,53 @@ def test_policies_that_are_taken_over_are_judged_as_where_they_were_trained(
         assert mine[name] == theirs[name], name
 
 
+def test_what_another_folder_has_chosen_stands_and_nothing_is_tuned(
+    run: Callable, options: Callable, finished: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(finished / "experiments", tmp_path / "chosen/experiments")
+    theirs = experiment(finished)
+    for row in theirs["own_best"]["rows"]:  # the other decoding, of the snapshot
+        if row["method"] == "dpa_omf":
+            temperature = 1.5 - row["temperature"]
+            file = f"seed_0/dpa_omf/step_2/eval_top_p_0.95_t_{temperature:g}.json"
+            row |= {"temperature": temperature, "file": file}
+    (tmp_path / "chosen/experiments/methods.json").write_text(json.dumps(theirs))
+    told = [*OTHERS, f"trained={finished}", f"decoding.chosen={tmp_path / 'chosen'}"]
+    outcome = run("compare", *command(options, tmp_path / "out", *told))
+    assert outcome.status == 0, outcome.err
+    mine = experiment(tmp_path / "out")
+    assert mine["tuning"] == [] and "tune" not in mine["stages"]
+    assert mine["chosen"] == theirs["chosen"] | {"dpa_omf": [0.95, temperature]}
+    assert mine["steps"]["own_best"] == theirs["steps"]["own_best"] | {"dpa_omf": 2}
+    assert mine["rows"] == theirs["rows"]
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ([*OTHERS, "experiment.name=other"], "has no finished experiment 'other'; run it there first"),
+        ([*OTHERS, "decoding.common=[0.95,0.5]"], "compares at [0.95, 1.0]; say decoding.common=[0.95, 1.0] here"),
+        (OTHERS[:1], "has chosen nothing for sft_best_ade; it has reference, dpa_omf"),
+        (
+            [*OTHERS, "alignment.snapshots=[3]"],
+            "which is none of dpa_omf@3, dpa_omf; have the same alignment.snapshots",
+        ),
+    ],
+)
+def test_a_choice_that_does_not_fit_is_refused(
+    run: Callable, options: Callable, finished: Path, tmp_path: Path, more: list[str], message: str
+) -> None:
+    shutil.copytree(finished / "experiments", tmp_path / "chosen/experiments")
+    theirs = experiment(finished)
+    for row in theirs["rows"]:
+        if row["method"] == "dpa_omf":
+            row["file"] = "seed_0/dpa_omf/step_2/eval_top_p_0.95_t_1.json"
+    (tmp_path / "chosen/experiments/methods.json").write_text(json.dumps(theirs))
+    told = run("compare", *command(options, tmp_path / "out", *more, f"decoding.chosen={tmp_path / 'chosen'}"))
+    assert told.status == 2 and message in told.err, told.err
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_folder_is_taken_over_whole_once_and_not_trained_on(
     run: Callable, options: Callable, finished: Path, tmp_path: Path
 ) -> None:

@@ -21,9 +21,8 @@ ARCHIVES = Path(__file__).resolve().parents[2] / "docs" / "studies"
 OF_THE_MACHINE = ("compute", "stages", "worker_seconds", "versions", "command", "config", "date", "revision", "machine")
 """What differs between two runs of the same options."""
 SMALL = [
-    "seeds=[0]",
-    "decoding.common=[0.95,1.0]",
-    "decoding.grid=[[0.95,1.0]]",
+    "decoding.grid=[[0.95,1.0],[0.95,0.5]]",
+    "decoding.num_rollouts=2",
     "drift_rollouts=2",
     "alignment.watch_interval=4",
     "alignment.snapshots=[]",
@@ -246,16 +245,17 @@ def test_policies_that_were_trained_elsewhere_need_the_account_of_their_training
 
 @pytest.mark.slow
 def test_what_ran_in_parts_is_what_ran_as_a_whole(run: Callable, options: Callable, tmp_path: Path) -> None:
-    def compare(folder: Path, seeds: str, methods: str) -> Path:
-        told = [*SMALL, f"output={folder}", f"seeds=[{seeds}]", f"only=[{methods}]"]
+    def compare(folder: Path, seeds: str, *more: str) -> Path:
+        told = [*SMALL, f"output={folder}", f"seeds=[{seeds}]", "only=[dpa_omf,sft_best_oa]", *more]
         outcome = run("compare", *options("compare", *told))
         assert outcome.status == 0, outcome.err
         return folder
 
-    one = compare(tmp_path / "one", "0", "dpa_omf,sft_best_oa")
-    other = compare(tmp_path / "other", "1", "dpa_omf,sft_best_oa")
+    one = compare(tmp_path / "one", "0")
+    other = compare(tmp_path / "other", "1", f"decoding.chosen={one}")
     merge(tmp_path / "merged", [one, other])
-    together = compare(tmp_path / "together", "0,1", "dpa_omf,sft_best_oa")
+    together = compare(tmp_path / "together", "0,1", f"decoding.chosen={one}")
     theirs, ours = content(together), content(tmp_path / "merged")
-    kept = [name for name in ours if name not in OF_THE_MACHINE]
+    kept = [name for name in ours if name not in (*OF_THE_MACHINE, "tuning")]
     assert {name: ours[name] for name in kept} == {name: theirs[name] for name in kept}
+    assert ours["tuning"] == content(one)["tuning"], "nothing was tuned for the other seed"
