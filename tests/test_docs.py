@@ -384,7 +384,7 @@ def model_of(references: list[str]) -> dict[str, Any]:
 
 
 SINCE = re.compile(
-    r"/(family|episode/\w+|tokenizer/(changes|reach)|auxiliary|context/(arrivals|control|decision_steps|horizon|max_controlled)"
+    r"/(chosen|family|episode/\w+|tokenizer/(changes|reach)|auxiliary|context/(arrivals|control|decision_steps|horizon|max_controlled)"
     r"|augmentation/(rotation|agent_drop))"
 )
 """Options that came or went, or moved from the context to the episode, after studies beside the results were made."""
