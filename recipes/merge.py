@@ -233,9 +233,10 @@ def _check_alike(parts: Sequence[Part]) -> None:
 
 
 def _shared(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Options that all parts must have alike."""
+    """Options that all parts must have alike; those of pre-training where an experiment has trained its references."""
     kept = OmegaConf.create(dict(config))
-    for name in (*APART, *METHODS):
+    unused = () if config["reference"] is None else ("pretraining",)
+    for name in (*APART, *METHODS, *unused):
         section, _, key = name.rpartition(".")
         (OmegaConf.select(kept, section) if section else kept).pop(key, None)
     return OmegaConf.to_container(kept)

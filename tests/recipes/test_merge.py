@@ -130,6 +130,15 @@ def test_the_report_tells_the_commands_of_all_parts(merged: Path, tmp_path: Path
     assert "Not here yet" not in report(merged, tmp_path / "all.html").read_text()
 
 
+def test_options_of_a_pre_training_that_was_not_done_may_differ(parts: list[Path], tmp_path: Path) -> None:
+    def other_training(found: dict[str, Any]) -> None:
+        found["config"]["pretraining"]["steps"] += 1
+
+    shutil.copytree(parts[1], tmp_path / "later")
+    later = edit(tmp_path / "later", "experiments/families.json", other_training)
+    assert merge(tmp_path / "all", [parts[0], later, parts[2]]).is_file()
+
+
 def test_the_first_part_that_has_a_method_decides_how_it_is_decoded(
     parts: list[Path], whole: Path, tmp_path: Path
 ) -> None:
