@@ -135,6 +135,7 @@ def test_every_experiment_runs_in_the_folder_of_the_first(
         assert all(Path(row["file"]).name.startswith("tune_") for row in found["rows"])
 
 
+@pytest.mark.slow
 def test_policies_that_are_taken_over_are_judged_as_where_they_were_trained(
     run: Callable, options: Callable, finished: Path, tmp_path: Path
 ) -> None:
@@ -146,6 +147,7 @@ def test_policies_that_are_taken_over_are_judged_as_where_they_were_trained(
         assert mine[name] == theirs[name], name
 
 
+@pytest.mark.slow
 def test_what_another_folder_has_chosen_stands_and_nothing_is_tuned(
     run: Callable, options: Callable, finished: Path, tmp_path: Path
 ) -> None:
@@ -193,6 +195,7 @@ def test_a_choice_that_does_not_fit_is_refused(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_folder_is_taken_over_whole_once_and_not_trained_on(
     run: Callable, options: Callable, finished: Path, tmp_path: Path
 ) -> None:

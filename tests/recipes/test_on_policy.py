@@ -46,6 +46,7 @@ def test_it_needs_no_preferences_and_tells_what_it_rolls_out(
     assert any(not torch.equal(after[0][name], value) for name, value in before.items())
 
 
+@pytest.mark.slow
 def test_a_policy_gradient_comes_nearer_to_the_log(
     run: Callable, options: Callable, origin: Path, tmp_path: Path
 ) -> None:
