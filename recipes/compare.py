@@ -15,7 +15,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Sequence
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import hydra
@@ -34,6 +33,7 @@ from recipes.experiment.check import check_experiment
 from recipes.experiment.jobs import (
     adopt_job,
     align_job,
+    chosen_by,
     collect_job,
     evaluate_job,
     likelihood_job,
@@ -46,7 +46,7 @@ from recipes.experiment.logged import log_experiment
 from recipes.experiment.methods import checkpoints_of, kept, levels, policies_of, read_setups
 from recipes.experiment.pictures import write_players
 from recipes.experiment.pool import Workers
-from recipes.experiment.runs import Run, RunFolder
+from recipes.experiment.runs import Run
 from recipes.experiment.stages import Stages, alone_in
 from recipes.experiment.summary import Chosen, chosen_in, summarise_experiment
 from recipes.report import report
@@ -118,7 +118,7 @@ def choose(cfg: DictConfig, stages: Stages) -> Chosen:
     """
     policies = checkpoints_of(cfg)
     if cfg.decoding.chosen is not None:
-        theirs = chosen_in(read_experiment(RunFolder(Path(cfg.decoding.chosen)).experiment(cfg.experiment.name)))
+        theirs = chosen_in(read_experiment(chosen_by(cfg)))
         common, best = ({method: runs[method] for method in policies} for runs in (theirs.common, theirs.best))
         return Chosen(common=common, best=best, tuned=frozenset())
     runs = {method: [Run(*each) for each in product(among, decodings(cfg))] for method, among in policies.items()}

@@ -16,8 +16,9 @@ import shutil
 import sys
 import tempfile
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,7 +38,7 @@ from recipes.experiment.jobs import evaluate_job, runs_of
 from recipes.experiment.logged import log_experiment
 from recipes.experiment.pool import Job
 from recipes.experiment.runs import Run, RunFolder
-from recipes.experiment.stages import Stages, read_account
+from recipes.experiment.stages import Stages, origins_beside, read_account
 from recipes.experiment.summary import Chosen, chosen_in, policy_of, summarise_experiment
 
 METHODS = ("methods", "rankings", "experiment.setup", "experiment.labels", "experiment.published")
@@ -109,16 +110,16 @@ def merge(out: Path, parts: Sequence[Path], name: str | None = None, trained: Pa
         cfg = merged_config(opened, out, trained)
         runs = runs_of(cfg)
         _gather(opened, runs)
-        stages = Stages(Recorded(read_account(runs.stages)), runs.stages, provenance("merge", "cpu"))
+        made = provenance("merge", "cpu")
+        stages = Stages(Recorded(read_account(runs.stages)), runs.stages, made)
         chosen, tuning = chosen_first(opened), _tuning(opened)
         _check_whole(cfg, chosen)
         (train_policies if cfg.trained is None else adopt_policies)(cfg, stages)
-        tried = dict.fromkeys((row["seed"], policy_of(row), "tune", *decoding_of(row)) for row in tuning)
-        stages.run("tune", evaluate_job, cfg, list(tried))
+        tried = [(row["seed"], policy_of(row), "tune", *decoding_of(row)) for row in tuning]
+        stages.run("tune", evaluate_job, cfg, tried)
         measure(cfg, stages, chosen)
         found = summarise_experiment(cfg, opened[0].found.scenes, chosen, stages) | made_by(cfg, stages)
-        commands = dict.fromkeys(part.found.command for part in opened)
-        command = "\n".join([*commands, provenance("merge", "cpu")["command"]])
+        command = "\n".join([*dict.fromkeys(part.found.command for part in opened), made["command"]])
         write_json(runs.experiment(cfg.experiment.name), found | {"tuning": tuning, "command": command})
         log_experiment(cfg, read_experiment(runs.experiment(cfg.experiment.name)), {})
     return runs.experiment(cfg.experiment.name)
@@ -139,11 +140,8 @@ def merged_config(parts: Sequence[Part], output: Path, trained: Path | None) -> 
         raise ValueError(f"--trained {trained}: these parts have trained their policies themselves; leave it out.")
     cfg = OmegaConf.create(dict(parts[0].found.config))
     for each in METHODS:
-        sections = [OmegaConf.select(OmegaConf.create(dict(part.found.config)), each) for part in reversed(parts)]
-        OmegaConf.update(cfg, each, OmegaConf.merge(*sections), merge=False)
-    order = dict.fromkeys(method for part in parts for method in part.found.config["methods"])
-    cfg.methods = {method: cfg.methods[method] for method in order}
-    starts = {seed: start for part in reversed(parts) for seed, start in _references(part).items()}
+        OmegaConf.update(cfg, each, _first(_select(part.found.config, each) for part in parts), merge=False)
+    starts = _first(map(_references, parts))
     cfg.seeds = sorted(starts)
     cfg.reference = None if None in starts.values() else [starts[seed] for seed in cfg.seeds]
     cfg.output, cfg.trained = str(output), None if trained is None else str(trained)
@@ -158,17 +156,22 @@ def _references(part: Part) -> dict[int, str | None]:
 
 def chosen_first(parts: Sequence[Part]) -> Chosen:
     """What stands for each method in the first part that has it."""
-    common: dict[str, Run] = {}
-    best: dict[str, Run] = {}
-    for chosen in (chosen_in(part.found) for part in parts):
-        common |= {method: run for method, run in chosen.common.items() if method not in common}
-        best |= {method: run for method, run in chosen.best.items() if method not in best}
+    each = [chosen_in(part.found) for part in parts]
+    common, best = _first(chosen.common for chosen in each), _first(chosen.best for chosen in each)
     return Chosen(common=common, best=best, tuned=frozenset())
+
+
+def _first(each: Iterable[Mapping[Any, Any]]) -> dict[Any, Any]:
+    """All entries in the order of the parts; of those with one name that of the first part."""
+    union: dict[Any, Any] = {}
+    for entries in each:
+        union |= {name: entry for name, entry in entries.items() if name not in union}
+    return union
 
 
 def _tuning(parts: Sequence[Part]) -> list[Mapping[str, Any]]:
     """Rows of the tuning scenes, each once, in the order of tables."""
-    rows = {row["file"]: row for part in reversed(parts) for row in part.found.tuning}.values()
+    rows = _first({row["file"]: row for row in part.found.tuning} for part in parts).values()
     methods = list(dict.fromkeys(method for part in parts for method in part.found.methods))
     tried = list(dict.fromkeys(decoding_of(row) for part in parts for row in part.found.tuning))
     return sorted(rows, key=lambda row: (methods.index(row["method"]), tried.index(decoding_of(row)), row["seed"]))
@@ -223,13 +226,11 @@ def _check_alike(parts: Sequence[Part]) -> None:
             raise ValueError(f"{both}: they report another metric or split.")
         if differ := differences(_shared(first.found.config), _shared(part.found.config)):
             raise ValueError(f"{both}: they ran with other options ({differ}).")
-    for place, part in enumerate(parts):
-        for earlier in parts[:place]:
-            for each in METHODS:
-                theirs, ours = (_select(side.found.config, each) for side in (earlier, part))
-                both = theirs.keys() & ours.keys()
-                if differ := differences(*({name: side[name] for name in both} for side in (theirs, ours))):
-                    raise ValueError(f"{each} differs between {earlier.name} and {part.name}: {differ}.")
+    for (earlier, part), each in product(combinations(parts, 2), METHODS):
+        theirs, ours = (_select(side.found.config, each) for side in (earlier, part))
+        both = theirs.keys() & ours.keys()
+        if differ := differences(*({name: side[name] for name in both} for side in (theirs, ours))):
+            raise ValueError(f"{each} differs between {earlier.name} and {part.name}: {differ}.")
 
 
 def _shared(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -256,14 +257,12 @@ def _gather(parts: Sequence[Part], runs: RunFolder) -> None:
     """
     account: dict[str, dict[str, float]] = {}
     origins: dict[str, Any] = {"made": [], "jobs": {}}
-    cards: dict[str, Any] = {}
     for part in parts:
         for file in files_of(part.runs.root):
             relative = file.relative_to(part.runs.root)
             if relative.parts[0].startswith("seed_"):
                 _take(file, runs.root / relative, part)
-        cards = {name: card.to_json() for name, card in read_preference_cards(part.runs.root).items()} | cards
-        theirs = read_json(part.runs.stages.with_name("origins.json"))
+        theirs = read_json(origins_beside(part.runs.stages))
         origins["made"] += [each for each in theirs["made"] if each not in origins["made"]]
         for stage, jobs in read_account(part.runs.stages).items():
             kept, signed = account.setdefault(stage, {}), origins["jobs"].setdefault(stage, {})
@@ -272,8 +271,9 @@ def _gather(parts: Sequence[Part], runs: RunFolder) -> None:
                 signed[job] = origins["made"].index(theirs["made"][theirs["jobs"][stage][job]])
     shutil.copyfile(parts[0].runs.scenes, runs.scenes)
     write_json(runs.stages, account)
-    write_json(runs.stages.with_name("origins.json"), origins)
-    write_json(runs.root / KEPT, cards)
+    write_json(origins_beside(runs.stages), origins)
+    cards = _first(read_preference_cards(part.runs.root) for part in parts)
+    write_json(runs.root / KEPT, {name: card.to_json() for name, card in cards.items()})
 
 
 def _take(file: Path, place: Path, part: Part) -> None:

@@ -157,6 +157,11 @@ class Experiment:
     command: str
 
     @property
+    def put_together(self) -> bool:
+        """Its parts ran apart, so that its policies are elsewhere."""
+        return len(self.command.splitlines()) > 1
+
+    @property
     def reported(self) -> str:
         """The scenes that the numbers are of, such as ``54 evaluation scenes``."""
         return f"{self.scenes[self.split]} {SPLITS[self.split]} scenes"

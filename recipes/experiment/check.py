@@ -26,9 +26,8 @@ from recipes.common.cli import check_steps, plain, told_of
 from recipes.common.limits import GROUPS, check_limits, is_number
 from recipes.common.models import build_policy
 from recipes.common.rankings import build_distance, ranking_options
-from recipes.experiment.jobs import check_made_alike, compared_policy, reference_of, trained_in
+from recipes.experiment.jobs import check_made_alike, chosen_by, compared_policy, reference_of, trained_in
 from recipes.experiment.methods import checkpoints_of, policies_of, read_setups
-from recipes.experiment.runs import RunFolder
 from recipes.experiment.summary import chosen_in, labels
 
 CHECKPOINTS = ("last", "select", "all")
@@ -146,7 +145,7 @@ def _check_decodings(cfg: DictConfig) -> None:
 def _check_chosen(cfg: DictConfig) -> None:
     """The folder that chose has finished this experiment, with these methods, snapshots and common decoding."""
     told, name = f"decoding.chosen={cfg.decoding.chosen}", cfg.experiment.name
-    path = RunFolder(Path(cfg.decoding.chosen)).experiment(name)
+    path = chosen_by(cfg)
     if not path.is_file():
         raise ValueError(
             f"{told} has no finished experiment {name!r}; run it there first, or say decoding.chosen=null."

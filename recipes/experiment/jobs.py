@@ -208,6 +208,11 @@ def runs_of(cfg: DictConfig) -> RunFolder:
     return RunFolder(Path(cfg.output))
 
 
+def chosen_by(cfg: DictConfig) -> Path:
+    """The experiment that ``decoding.chosen`` leaves the choice of checkpoints and decodings to."""
+    return RunFolder(Path(cfg.decoding.chosen)).experiment(cfg.experiment.name)
+
+
 def trained_in(cfg: DictConfig) -> RunFolder:
     """The folder where policies were trained: another one than the study's where they are taken over."""
     return runs_of(cfg) if cfg.trained is None else RunFolder(Path(cfg.trained))

@@ -31,6 +31,7 @@ class Stages:
     def __init__(self, workers: Workers, path: Path, made: Mapping[str, Any]) -> None:
         self.workers, self.path, self._made = workers, path, made
         self.account = read_account(path)
+        self._origins_path = origins_beside(path)
         self._origins = read_json(self._origins_path) if self._origins_path.is_file() else {"made": [], "jobs": {}}
         self._asked: dict[str, set[str]] = {}
 
@@ -70,10 +71,6 @@ class Stages:
         write_json(self._origins_path, self._origins)
 
     @property
-    def _origins_path(self) -> Path:
-        return self.path.with_name("origins.json")
-
-    @property
     def seconds(self) -> dict[str, float]:
         """Worker-seconds of each stage, of the jobs that were asked for here."""
         return {name: sum(self.account[name][job] for job in sorted(jobs)) for name, jobs in self._asked.items()}
@@ -85,6 +82,11 @@ class Stages:
         made, jobs = [*self._origins["made"], unsigned], self._origins["jobs"]
         asked = [(stage, job) for stage, each in self._asked.items() for job in sorted(each)]
         return merged([made[jobs.get(stage, {}).get(job, -1)] for stage, job in asked])
+
+
+def origins_beside(path: Path) -> Path:
+    """What made the jobs of an account."""
+    return path.with_name("origins.json")
 
 
 def read_account(path: Path) -> dict[str, dict[str, float]]:

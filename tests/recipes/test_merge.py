@@ -76,11 +76,12 @@ def part_of(whole: Path, folder: Path, seeds: Iterable[int], methods: Iterable[s
         found["own_best"]["versus"] = []
         found["command"] = f"python -m recipes.compare {seeds}"
 
+    def ran(stage: str, seed: str, *names: str) -> bool:
+        return int(seed) in seeds and (stage == "pretrain" or not {*names}.isdisjoint(methods))
+
     def booked(account: dict[str, dict[str, float]]) -> None:
-        for jobs in account.values():
-            for job in [job for job in jobs if int(job.split()[1]) not in seeds or not {*job.split()} & {*methods}]:
-                if not job.startswith("pretrain") or int(job.split()[1]) not in seeds:
-                    del jobs[job]
+        for stage, jobs in account.items():
+            account[stage] = {job: value for job, value in jobs.items() if ran(*job.split())}
 
     edit(folder, path_of(folder).relative_to(folder), cut)
     edit(folder, "stages.json", booked)

@@ -24,9 +24,9 @@ def missing_section(study: Study, experiments: Iterable[str]) -> Section | None:
         study: of the page.
         experiments: names of all that ``recipes.compare`` knows.
     """
-    folder = study.folder
-    if study.main is not None and len(study.main.command.splitlines()) > 1:  # its policies are where its parts are
+    if study.main is not None and study.main.put_together:
         return None
+    folder = study.folder
     options = _options(study)
     lacking = {
         f"experiment {name}": shlex.join(["python", "-m", "recipes.compare", f"experiment={name}", *options])
