@@ -83,7 +83,8 @@ def test_rows_of_a_pass_change_rounding_alone(
     run: Callable, options: Callable, origin: Path, tmp_path: Path, method: str
 ) -> None:
     for name, rows in (("one", 1), ("all", 999)):
-        outcome = run("align", *aligning(options, origin, method, tmp_path / name, f"alignment.max_rows={rows}"))
+        more = (f"alignment.max_rows={rows}", "alignment.steps=2")
+        outcome = run("align", *aligning(options, origin, method, tmp_path / name, *more))
         assert outcome.status == 0, outcome.err
     assert_same(tmp_path / "one", tmp_path / "all", atol=1e-5)
 
