@@ -4,7 +4,8 @@
     python -m recipes.difference EVALUATION OTHER
 
 RUNS is the folder that recipes.compare fills (its output), or an archive of one, unpacked. Each method stands at its
-own best decoding, or at those that are given. OTHER may be of another experiment of the same folder, NAME:METHOD.
+own best decoding, or at those that are given. OTHER may be of another experiment of the same folder, NAME:METHOD, or a
+rung of recipes.ladder on the same scenes, LADDER/log_through_tokens.json, which is the same under every seed.
 EVALUATION is what recipes.evaluate writes, a JSON, or a folder with one for each seed. From the values of every scene:
 nothing is run.
 """
@@ -21,11 +22,12 @@ from rich.console import Console
 from rich.table import Table
 
 from dpa.report.experiment import Decoding, Experiment, decoding_of, in_words, read_experiment, read_json
-from dpa.report.paired import Rows, paired_values
+from dpa.report.paired import Evaluated, Rows, paired_values
 from dpa.report.statistics import Interval, paired_bootstrap
 from dpa.report.study import Evaluations
 from dpa.report.table import print_whole
 from recipes.common.cli import refused
+from recipes.studies.laddered import read_rung
 
 COMPARED = ("scenes", "evaluation", "ranking")
 """Options that two evaluations must share to be compared."""
@@ -78,6 +80,30 @@ def differences(side: Side, other: Side, evaluations: Evaluations, at: Sequence[
     likely = [_likely(*each, rows) for each, rows in zip(both, evaluated, strict=True)]
     for mine, base in (evaluated, likely):
         yield from _measures(mine, base, evaluations)
+
+
+def differences_to_rung(
+    side: Side, rung: Path, evaluations: Evaluations, at: Decoding | None = None
+) -> Iterator[Difference]:
+    """Every measure that a rung of a ladder has, of one method minus it.
+
+    Args:
+        side: the method.
+        rung: file of the rung, which stands beside each seed of the method.
+        evaluations: figures of every scene.
+        at: decoding of the method; by default its own best.
+
+    Raises:
+        ValueError: as of :func:`differences`, or a rung of other scenes, rollouts or metric.
+    """
+    rows = _rows(*side, at or side.experiment.chosen.get(side.method))
+    _check_files(rows, evaluations)
+    values = {}
+    for row in rows:
+        options = read_json(evaluations.folder / row["file"])["options"]
+        values[str(rung)] = read_rung(rung, options, f"{side.method} of seed {row['seed']}")
+    beside = [{"seed": row["seed"], "file": str(rung)} for row in rows]
+    yield from _measures(rows, beside, lambda file: values.get(file) or evaluations(file))
 
 
 def differences_of_files(evaluation: Path, other: Path) -> Iterator[Difference]:
@@ -140,7 +166,7 @@ def _read_seeds(path: Path) -> dict[int, _Evaluation]:
     return dict(sorted(found.items()))
 
 
-def _measures(mine: Rows, base: Rows, evaluations: Evaluations) -> Iterator[Difference]:
+def _measures(mine: Rows, base: Rows, evaluations: Evaluated) -> Iterator[Difference]:
     measures = evaluations(mine[0]["file"]) if mine else None
     for measure in measures or ():
         both = paired_values(mine, base, measure, evaluations)
@@ -204,7 +230,7 @@ def make_parser() -> argparse.ArgumentParser:
         metavar="OTHER",
         nargs="?",
         default="reference",
-        help="by default the reference; NAME:METHOD of another experiment",
+        help="by default the reference; NAME:METHOD of another experiment; a rung's file, LADDER/log.json",
     )
     parser.add_argument(
         "--at", metavar="TOP_P,T", type=decoding, nargs="+", default=[], help="decoding of both, or one of each"
@@ -222,7 +248,7 @@ def main() -> None:
             names = str(given.runs), given.experiment
             found = list(differences_of_files(*map(Path, names)))
         else:
-            names = given.method, given.other
+            names = given.method, in_table(given.other)
             found = list(_of_experiment(given))
         if not found:
             raise ValueError(f"{' and '.join(names)} have no seed and scene in common.")
@@ -235,9 +261,23 @@ def _of_experiment(given: argparse.Namespace) -> Iterator[Difference]:
     if len(given.at) > 2:
         raise ValueError(f"--at takes one decoding for both, or one of each, got {len(given.at)}.")
     side = Side(_read(given.runs, given.experiment), given.method)
+    if given.other.endswith(".json"):
+        if len(given.at) > 1:
+            raise ValueError("--at takes one decoding beside a rung, which has none.")
+        return differences_to_rung(side, Path(given.other), Evaluations(given.runs), *given.at)
     name, _, method = given.other.rpartition(":")
     other = Side(_read(given.runs, name) if name else side.experiment, method)
     return differences(side, other, Evaluations(given.runs), given.at)
+
+
+def in_table(other: str) -> str:
+    """What a side is called: a rung as its ladder calls it.
+
+    Examples:
+        >>> in_table("runs/ladder/log_through_tokens.json")
+        'log through tokens'
+    """
+    return Path(other).stem.replace("_", " ") if other.endswith(".json") else other
 
 
 def _read(runs: Path, name: str) -> Experiment:

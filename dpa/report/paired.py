@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,14 +10,15 @@ from numpy.typing import NDArray
 
 from dpa.report.markup import Html, html, quiet, stacked
 from dpa.report.statistics import Interval, paired_bootstrap
-from dpa.report.study import Evaluations
 from dpa.report.table import MISSING
 
 Rows = Sequence[Mapping[str, Any]]
 """Rows of a method at one decoding, one for each seed, with their ``file``."""
+Evaluated = Callable[[str], Mapping[str, Sequence[float | None]] | None]
+"""Figures of every scene of a file, such as :class:`~dpa.report.study.Evaluations` reads; None if it is not there."""
 
 
-def scene_values(groups: Sequence[Rows], figures: Sequence[str], evaluations: Evaluations) -> NDArray | None:
+def scene_values(groups: Sequence[Rows], figures: Sequence[str], evaluations: Evaluated) -> NDArray | None:
     """Figures of several methods or decodings, paired by seed and scene.
 
     Args:
@@ -43,13 +44,13 @@ def scene_values(groups: Sequence[Rows], figures: Sequence[str], evaluations: Ev
     return values if values.shape[-1] else None
 
 
-def paired_values(mine: Rows, base: Rows, key: str, evaluations: Evaluations) -> NDArray | None:
+def paired_values(mine: Rows, base: Rows, key: str, evaluations: Evaluated) -> NDArray | None:
     """A figure of two methods, ``[2, seeds, scenes]``; None as in :func:`scene_values`."""
     values = scene_values([mine, base], [key], evaluations)
     return None if values is None else values[0]
 
 
-def paired_figure(mine: Rows, base: Rows, key: str, evaluations: Evaluations) -> Interval | None:
+def paired_figure(mine: Rows, base: Rows, key: str, evaluations: Evaluated) -> Interval | None:
     """A figure minus that of another method, with its interval; None as in :func:`scene_values`."""
     both = paired_values(mine, base, key, evaluations)
     return None if both is None else paired_bootstrap(both[0], both[1])

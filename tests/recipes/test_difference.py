@@ -14,7 +14,7 @@ from dpa.report.experiment import read_experiment
 from dpa.report.statistics import paired_bootstrap
 from dpa.report.study import Evaluations
 from recipes import difference
-from recipes.difference import Difference, Side, differences, differences_of_files
+from recipes.difference import Difference, Side, differences, differences_of_files, differences_to_rung
 from tests.dpa.report.runs import BEST, COMMON, SEEDS, likelihoods, values, write_runs
 
 
@@ -129,6 +129,59 @@ def test_what_is_not_there_is_one_clear_sentence(
     with pytest.raises(SystemExit) as stopped:
         difference.main()
     assert stopped.value.code == 2 and message in capsys.readouterr().err
+
+
+METRIC = ["2024", "f0"]
+EVALUATED = {"scenes": "a", "evaluation": {"num_rollouts": 32, "metric": METRIC}}
+RUNG = {"scenes": "a", "num_rollouts": 32, "years": {"2023": ["2023", "e0"], "2024": METRIC}}
+
+
+def with_rung(folder: Path, rung: dict | None) -> tuple[Path, Path, np.ndarray]:
+    """Results whose evaluations say what decided them, a rung beside them, and its realism by scene."""
+    runs = write_runs(folder / "runs")
+    for path in runs.rglob("eval_*.json"):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"options": EVALUATED}))
+    realism = np.random.default_rng(0).uniform(0.7, 0.9, len(values("dpa_omf", 0, COMMON)["realism"]))
+    scored = [{"2023": {"realism": 0.0}, "2024": {"realism": float(value)}} for value in realism]
+    path = folder / "the_log.json"
+    if rung is not None:
+        path.write_text(json.dumps({"options": RUNG | rung, "per_scene": scored}))
+    return runs, path, realism
+
+
+def test_a_rung_stands_beside_every_seed_by_the_metric_of_the_evaluation(tmp_path: Path) -> None:
+    runs, rung, realism = with_rung(tmp_path, {})
+    experiment = read_experiment(runs / "experiments" / "methods.json")
+    (found,) = differences_to_rung(Side(experiment, "dpa_omf"), rung, Evaluations(runs), COMMON)
+    mine = np.array([values("dpa_omf", seed, COMMON)["realism"] for seed in SEEDS])
+    assert found.interval == paired_bootstrap(mine, np.broadcast_to(realism, mine.shape))
+    assert (found.measure, found.other) == ("realism", pytest.approx(realism.mean()))
+
+
+@pytest.mark.parametrize(
+    ("rung", "message"),
+    [
+        ({"scenes": "b"}, "the_log.json has scenes b and dpa_omf of seed 0 has a; run both with the same"),
+        ({"num_rollouts": 8}, "the_log.json has num_rollouts 8 and dpa_omf of seed 0 has 32"),
+        (
+            {"years": {"2025": ["2025", "a0"]}},
+            "was scored by 2025 (a0) and dpa_omf of seed 0 by 2024 (f0); run recipes.ladder with years=[2024]",
+        ),
+        (None, "the_log.json is no rung that recipes.ladder wrote; name a file of its folder"),
+    ],
+)
+def test_a_rung_that_cannot_be_paired_is_refused(
+    rung: dict | None,
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+) -> None:
+    runs, path, _ = with_rung(tmp_path, rung)
+    monkeypatch.setattr(sys, "argv", ["difference", str(runs), "methods", "dpa_omf", str(path)])
+    with pytest.raises(SystemExit):
+        difference.main()
+    assert message in " ".join(capsys.readouterr().err.split())
 
 
 def lay_out(folder: Path, method: str, **options: object) -> Path:
