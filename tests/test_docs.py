@@ -384,10 +384,11 @@ def model_of(references: list[str]) -> dict[str, Any]:
 
 
 SINCE = re.compile(
-    r"/(chosen|family|episode/\w+|tokenizer/(changes|reach)|auxiliary|context/(arrivals|control|decision_steps|horizon|max_controlled)"
+    r"/(checkpoint_interval|chosen|family|episode/\w+|tokenizer/(changes|reach)|auxiliary|context/(arrivals|control|decision_steps|horizon|max_controlled)"
     r"|augmentation/(rotation|agent_drop))"
 )
-"""Options that came or went, or moved from the context to the episode, after studies beside the results were made."""
+"""Options that came or went, or moved from the context to the episode, after studies beside the results were made; and
+one that decides nothing."""
 
 
 @pytest.mark.slow
