@@ -98,12 +98,9 @@ def differences_to_rung(
     """
     rows = _rows(*side, at or side.experiment.chosen.get(side.method))
     _check_files(rows, evaluations)
-    values = {}
-    for row in rows:
-        options = read_json(evaluations.folder / row["file"])["options"]
-        values[str(rung)] = read_rung(rung, options, f"{side.method} of seed {row['seed']}")
+    values = read_rung(rung, {f"{side.method} of seed {row['seed']}": evaluations.folder / row["file"] for row in rows})
     beside = [{"seed": row["seed"], "file": str(rung)} for row in rows]
-    yield from _measures(rows, beside, lambda file: values.get(file) or evaluations(file))
+    yield from _measures(rows, beside, lambda file: values if file == str(rung) else evaluations(file))
 
 
 def differences_of_files(evaluation: Path, other: Path) -> Iterator[Difference]:
