@@ -339,6 +339,7 @@ def test_the_tables_of_the_results_are_those_of_the_studies_beside_them(study: S
             comparison_table(experiment, experiment.own_best),
             None if one else comparison_table(experiment, experiment.at_common),
             safety_table(experiment, experiment.own_best, evaluations),
+            None if one else safety_table(experiment, experiment.at_common, evaluations),
             sharpness_table(experiment, evaluations),
             likelihood_table(experiment, evaluations) if experiment.likelihood else None,
             None if learnt is None else learnt_table(learnt),

@@ -10,7 +10,7 @@ from dpa.report.findings import budgets, chosen_on_the_same, headline, left_out,
 from dpa.report.likelihoods import ABOUT_LEARNT, LEARNT, Learnt, likelihoods, shown_figures, who_learns
 from dpa.report.matched import ABOUT_SHARPNESS, SHARPNESS, sharpness_rows
 from dpa.report.paired import paired_figure
-from dpa.report.sections.safety import groups_of
+from dpa.report.sections.safety import digits_of, groups_of, named
 from dpa.report.statistics import Interval
 from dpa.report.study import Evaluations, Study
 from dpa.report.table import (
@@ -24,6 +24,8 @@ from dpa.report.table import (
     number,
     to_markdown,
 )
+
+WITH_DIFFERENCE = "with the difference from the reference; less is better, but for spread"
 
 
 def study_text(study: Study) -> str:
@@ -56,7 +58,7 @@ def _experiment(experiment: Experiment, evaluations: Evaluations) -> Iterator[st
         yield f"**All at {next(iter(compared))}**, the one decoding of this experiment:"
     yield comparison_table(experiment, experiment.own_best)
     if safety := safety_table(experiment, experiment.own_best, evaluations):
-        yield "**Safety**, with the difference from the reference; less is better:"
+        yield f"**Safety, and what it costs**, {WITH_DIFFERENCE}:"
         yield safety
     if told := ordering(experiment):
         yield f"Against {experiment.labels[experiment.versus]}, {told}."
@@ -71,6 +73,9 @@ def _experiment(experiment: Experiment, evaluations: Evaluations) -> Iterator[st
     if "common" in compared:
         yield "**All at the common decoding**, and the reference at the others:"
         yield comparison_table(experiment, experiment.at_common)
+        if safety := safety_table(experiment, experiment.at_common, evaluations):
+            yield f"**Safety, and what it costs, at the common decoding**, {WITH_DIFFERENCE}:"
+            yield safety
     if told := sharpness_table(experiment, evaluations):
         yield f"**At equal sharpness** of sampling: {ABOUT_SHARPNESS}:"
         yield told
@@ -107,7 +112,7 @@ def comparison_table(experiment: Experiment, comparison: Comparison) -> str:
 
 
 def safety_table(experiment: Experiment, comparison: Comparison, evaluations: Evaluations) -> str | None:
-    """Rates of every method, first those that neither the distance nor the metric sees (``docs/safety.md``).
+    """Rates of every method (``docs/safety.md``), and what they may be paid with, minADE and spread [m].
 
     Args:
         experiment: that it is of.
@@ -115,7 +120,7 @@ def safety_table(experiment: Experiment, comparison: Comparison, evaluations: Ev
         evaluations: figures of every scene; without them the differences have no intervals and are left out.
 
     Returns:
-        Markdown; None where no safety was measured.
+        Markdown, in the order of :func:`~dpa.report.sections.safety.groups_of`; None where no safety was measured.
     """
     records, base = comparison.records(), comparison.base()
     names = {key: name for group in groups_of(experiment).values() for key, name in group.items()}
@@ -128,8 +133,8 @@ def safety_table(experiment: Experiment, comparison: Comparison, evaluations: Ev
         cells = []
         for key in shown:
             found = None if mine == base else paired_figure(mine, base, key, evaluations)
-            cells.append(_with_change(number(record.get(key), 3), found))
-        rows.append([experiment.labels[record["method"]], *cells])
+            cells.append(_with_change(number(record.get(key), digits_of(key)), found, digits_of(key)))
+        rows.append([named(experiment, record, mine == base), *cells])
     return to_markdown(["method", *(names[key] for key in shown)], rows)
 
 

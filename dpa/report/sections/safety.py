@@ -1,8 +1,11 @@
-"""Safety of an experiment's methods, by who else sees it: nobody, the paper's distance, the metric, or both."""
+"""Safety of an experiment's methods, by who else sees it: nobody, the paper's distance, the metric, or both; and what
+it may be paid with.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 from dpa.report.experiment import Comparison, Experiment, decoding_of, in_words
 from dpa.report.markup import Html, element, hint, joined, table
@@ -16,6 +19,10 @@ RELATED = {"close_pass": "close pass", "harsh_jerk": "harsh jerk", "standing_mov
 SEEN = {"collision_rate": "collision", "offroad_rate": "off-road"}
 """In the paper's features of the preference distance, and in the metric."""
 MEASURES = UNSEEN | RELATED | SEEN
+PAID = {"min_ade": "minADE [m]", "spread": "spread [m]"}
+"""A policy that is safe and says one thing only has less spread, one that waits is far from the log."""
+DIGITS = {"min_ade": 2, "spread": 1}
+"""After the point; of rates three."""
 RED_LIGHTS = "2025"
 """The metrics of this year weigh driving through red lights (dpa/realism/config)."""
 
@@ -57,7 +64,13 @@ def groups_of(experiment: Experiment) -> dict[str, Mapping[str, str]]:
         "Relatives of the distance's clearance, effort and speed, measured otherwise": RELATED,
         f"Safety that the metric of {experiment.metric} sees, and the paper's preference distance does not": weighed,
         "Safety that both the paper's preference distance and the metric see": SEEN,
+        "What it may be paid with: distance to the log, and variety": PAID,
     }
+
+
+def digits_of(key: str) -> int:
+    """Digits after the point of a measure."""
+    return DIGITS.get(key, 3)
 
 
 def _table(
@@ -71,11 +84,21 @@ def _table(
     base, rows = comparison.base(), []
     for record in records:
         mine = comparison.of(record["method"], decoding_of(record))
-        name, cells = experiment.labels[record["method"]], []
+        cells = []
         for key in shown:
             found = None if mine == base else paired_figure(mine, base, key, evaluations)
-            cells.append(joined([number(record.get(key), 3), quiet_change(found)], ""))
-        if record["method"] == REFERENCE and mine != base:
-            name += f", {in_words(decoding_of(record))}"
-        rows.append([name, *cells])
-    return table(["method", *(f"{keys[key]}\N{NO-BREAK SPACE}↓" for key in shown)], rows)
+            digits = digits_of(key)
+            cells.append(joined([number(record.get(key), digits), quiet_change(found, digits)], ""))
+        rows.append([named(experiment, record, mine == base), *cells])
+    return table(["method", *(_title(key, keys[key]) for key in shown)], rows)
+
+
+def _title(key: str, name: str) -> str:
+    """With an arrow to where better values lie; more spread is neither better nor worse."""
+    return name if key == "spread" else f"{name}\N{NO-BREAK SPACE}↓"
+
+
+def named(experiment: Experiment, record: Mapping[str, Any], is_base: bool) -> str:
+    """What a row is called: the reference, where it is not what others are compared with, by its decoding too."""
+    name = experiment.labels[record["method"]]
+    return name if is_base or record["method"] != REFERENCE else f"{name}, {in_words(decoding_of(record))}"

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpa.report.experiment import read_experiment
+from dpa.report.experiment import in_words, read_experiment
 from dpa.report.matched import matched_difference
 from dpa.report.statistics import paired_bootstrap
 from dpa.report.study import Evaluations
@@ -80,7 +80,7 @@ def test_what_was_sampled_in_one_way_alone_has_one_table(tmp_path: Path) -> None
 
 def test_safety_has_rates_with_their_differences(runs: Path, text: str) -> None:
     methods = read_experiment(runs / "experiments" / "methods.json")
-    table = rows_of(block(text, methods.title), "**Safety**")
+    table = rows_of(block(text, methods.title), "**Safety, and what it costs**")
     assert list(table["reference"])[1:] == [
         "wrong way",
         "red light",
@@ -89,6 +89,8 @@ def test_safety_has_rates_with_their_differences(runs: Path, text: str) -> None:
         "standing moved",
         "collision",
         "off-road",
+        "minADE [m]",
+        "spread [m]",
     ]
     mine, base = ([values(name, seed, BEST)["harsh_jerk"] for seed in SEEDS] for name in ("dpa_omf", "reference"))
     both = np.array([mine, base], dtype=float)
@@ -96,6 +98,20 @@ def test_safety_has_rates_with_their_differences(runs: Path, text: str) -> None:
     change = paired_bootstrap(both[0], both[1])
     cell = f"{np.nanmean(np.array(mine, dtype=float)):.3f} ({difference(change.mean, (change.low, change.high))})"
     assert table["DPA-OMF"]["harsh jerk"] == [cell]
+
+
+def test_what_safety_costs_is_told_at_the_common_decoding_too(runs: Path, text: str) -> None:
+    methods = read_experiment(runs / "experiments" / "methods.json")
+    table = rows_of(block(text, methods.title), "**Safety, and what it costs, at the common decoding**")
+    others = {name for name in table if name.startswith("reference, ")}
+    assert others == {f"reference, {in_words(each)}" for each in GRID} - {f"reference, {in_words(COMMON)}"}
+    mine, base = (
+        np.array([values(name, seed, COMMON)["spread"] for seed in SEEDS]) for name in ("dpa_omf", "reference")
+    )
+    change = paired_bootstrap(mine, base)
+    assert table["DPA-OMF"]["spread [m]"] == [
+        f"{mine.mean():.1f} ({difference(change.mean, (change.low, change.high), 1)})"
+    ]
 
 
 def test_likelihoods_are_means_over_seeds(runs: Path, text: str) -> None:
