@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from dpa.report.experiment import Experiment
-from dpa.report.paired import paired_figure
+from dpa.report.paired import Cell, paired_figure
 from dpa.report.statistics import Interval
 from dpa.report.study import Evaluations
 from dpa.report.table import MINUS, REFERENCE, mean_over_seeds, measured, summarise
@@ -26,14 +26,6 @@ ABOUT_LEARNT = (
     "realism and minADE at the common decoding; pair accuracy, which depends on none, of the checkpoint that was "
     "chosen for the best one"
 )
-
-
-class Cell(NamedTuple):
-    """A figure of a method: its mean over seeds, the difference from another method, and how many digits it has."""
-
-    mean: float | None
-    change: Interval | None = None
-    digits: int = 3
 
 
 def shown_figures(experiment: Experiment) -> dict[str, str]:

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dpa.report.markup import Html, html, quiet, stacked
+from dpa.report.markup import Html, html, joined, quiet, stacked
 from dpa.report.statistics import Interval, paired_bootstrap
-from dpa.report.table import MISSING
+from dpa.report.table import MISSING, number
 
 Rows = Sequence[Mapping[str, Any]]
 """Rows of a method at one decoding, one for each seed, with their ``file``."""
 Evaluated = Callable[[str], Mapping[str, Sequence[float | None]] | None]
 """Figures of every scene of a file, such as :class:`~dpa.report.study.Evaluations` reads; None if it is not there."""
+
+
+class Cell(NamedTuple):
+    """A figure of a method: its mean over seeds, the difference from another method, and how many digits it has."""
+
+    mean: float | None
+    change: Interval | None = None
+    digits: int = 3
 
 
 def scene_values(groups: Sequence[Rows], figures: Sequence[str], evaluations: Evaluated) -> NDArray | None:
@@ -59,6 +67,11 @@ def paired_figure(mine: Rows, base: Rows, key: str, evaluations: Evaluated) -> I
 def quiet_change(found: Interval | None, digits: int = 3) -> Html:
     """A difference below the value that it belongs to; nothing where there is none."""
     return Html("") if found is None else quiet(found.mean, (found.low, found.high), found.over, digits)
+
+
+def with_change(cell: Cell) -> Html:
+    """A figure and, below it, its difference."""
+    return joined([number(cell.mean, cell.digits), quiet_change(cell.change, cell.digits)], "")
 
 
 def stacked_change(found: Interval | None) -> Html:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from dpa.report.account import account_rows
-from dpa.report.experiment import Comparison, Experiment, decoding_of
+from dpa.report.experiment import Comparison, Experiment
 from dpa.report.findings import budgets, chosen_on_the_same, headline, left_out, ordering, saturated
 from dpa.report.likelihoods import ABOUT_LEARNT, LEARNT, Learnt, likelihoods, shown_figures, who_learns
 from dpa.report.matched import ABOUT_SHARPNESS, SHARPNESS, sharpness_rows
-from dpa.report.paired import paired_figure
-from dpa.report.sections.safety import digits_of, groups_of, named
+from dpa.report.paired import Cell
+from dpa.report.sections.safety import groups_of, safety_rows
 from dpa.report.statistics import Interval
 from dpa.report.study import Evaluations, Study
 from dpa.report.table import (
@@ -122,20 +122,14 @@ def safety_table(experiment: Experiment, comparison: Comparison, evaluations: Ev
     Returns:
         Markdown, in the order of :func:`~dpa.report.sections.safety.groups_of`; None where no safety was measured.
     """
-    records, base = comparison.records(), comparison.base()
     names = {key: name for group in groups_of(experiment).values() for key, name in group.items()}
+    records = comparison.records()
     shown = measured(records, names)
     if not shown:
         return None
-    rows = []
-    for record in records:
-        mine = comparison.of(record["method"], decoding_of(record))
-        cells = []
-        for key in shown:
-            found = None if mine == base else paired_figure(mine, base, key, evaluations)
-            cells.append(_with_change(number(record.get(key), digits_of(key)), found, digits_of(key)))
-        rows.append([named(experiment, record, mine == base), *cells])
-    return to_markdown(["method", *(names[key] for key in shown)], rows)
+    rows = safety_rows(experiment, comparison, records, shown, evaluations)
+    titles = ["method", *(names[key] for key in shown)]
+    return to_markdown(titles, [[name, *map(_with_change, cells)] for name, cells in rows])
 
 
 def _published(experiment: Experiment, titles: Sequence[str]) -> Iterator[list[str]]:
@@ -172,7 +166,7 @@ def likelihood_table(experiment: Experiment, evaluations: Evaluations) -> str:
         evaluations: figures of every scene; without them the differences are left out.
     """
     rows = [
-        [experiment.labels[method], *(_with_change(number(c.mean, c.digits), c.change, c.digits) for c in cells)]
+        [experiment.labels[method], *map(_with_change, cells)]
         for method, cells in likelihoods(experiment, evaluations).items()
     ]
     return to_markdown(["method", *shown_figures(experiment).values()], rows)
@@ -190,8 +184,9 @@ def learnt_table(learnt: Learnt) -> str:
     return to_markdown(["method", *LEARNT.values()], rows)
 
 
-def _with_change(value: str, found: Interval | None, digits: int = 3) -> str:
-    return value if found is None else f"{value} ({difference(found.mean, (found.low, found.high), digits)})"
+def _with_change(cell: Cell) -> str:
+    value, found = number(cell.mean, cell.digits), cell.change
+    return value if found is None else f"{value} ({difference(found.mean, (found.low, found.high), cell.digits)})"
 
 
 def _change(found: Interval | None) -> str:

@@ -10,9 +10,9 @@ import numpy as np
 
 from dpa.report.charts import Chart, Line, curves, gallery
 from dpa.report.experiment import Experiment
-from dpa.report.likelihoods import ABOUT_LEARNT, LEARNT, Cell, Learnt, likelihoods, shown_figures, who_learns
+from dpa.report.likelihoods import ABOUT_LEARNT, LEARNT, Learnt, likelihoods, shown_figures, who_learns
 from dpa.report.markup import Html, Section, element, folded, hint, joined, sources, table
-from dpa.report.paired import quiet_change, stacked_change
+from dpa.report.paired import stacked_change, with_change
 from dpa.report.study import Evaluations
 from dpa.report.table import REFERENCE, number
 from dpa.training.loggers import Curve, read_curves
@@ -59,7 +59,7 @@ def likelihood_table(experiment: Experiment, evaluations: Evaluations) -> Html:
         for method in experiment.methods
     }
     rows = [
-        [experiment.labels[method], *map(_with_change, cells), sources(files[method])]
+        [experiment.labels[method], *map(with_change, cells), sources(files[method])]
         for method, cells in likelihoods(experiment, evaluations).items()
     ]
     learnt = who_learns(experiment, evaluations)
@@ -76,10 +76,6 @@ def likelihood_table(experiment: Experiment, evaluations: Evaluations) -> Html:
         ),
     ]
     return joined(parts)
-
-
-def _with_change(cell: Cell) -> Html:
-    return joined([number(cell.mean, cell.digits), quiet_change(cell.change, cell.digits)], "")
 
 
 def _table_3(learnt: Learnt, experiment: Experiment) -> Html:

@@ -4,14 +4,14 @@ it may be paid with.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from dpa.report.experiment import Comparison, Experiment, decoding_of, in_words
 from dpa.report.markup import Html, element, hint, joined, table
-from dpa.report.paired import paired_figure, quiet_change
+from dpa.report.paired import Cell, paired_figure, with_change
 from dpa.report.study import Evaluations
-from dpa.report.table import REFERENCE, measured, number
+from dpa.report.table import REFERENCE, measured
 
 UNSEEN = {"wrong_way": "wrong way", "red_light": "red light"}
 RELATED = {"close_pass": "close pass", "harsh_jerk": "harsh jerk", "standing_moved": "standing moved"}
@@ -68,9 +68,33 @@ def groups_of(experiment: Experiment) -> dict[str, Mapping[str, str]]:
     }
 
 
-def digits_of(key: str) -> int:
-    """Digits after the point of a measure."""
-    return DIGITS.get(key, 3)
+def safety_rows(
+    experiment: Experiment,
+    comparison: Comparison,
+    records: Sequence[Mapping[str, Any]],
+    keys: Sequence[str],
+    evaluations: Evaluations,
+) -> Iterator[tuple[str, list[Cell]]]:
+    """Measures of every row with the paired difference from the reference that others are compared with.
+
+    Args:
+        experiment: that they are of.
+        comparison: one of its two.
+        records: of it.
+        keys: of the measures.
+        evaluations: figures of every scene; without them there are no differences.
+
+    Returns:
+        What each row is called and its cells. The reference, where it is not the one that others are compared with,
+        is called by its decoding too.
+    """
+    base = comparison.base()
+    for record in records:
+        mine, name = comparison.of(record["method"], decoding_of(record)), experiment.labels[record["method"]]
+        if record["method"] == REFERENCE and mine != base:
+            name += f", {in_words(decoding_of(record))}"
+        changes = [None if mine == base else paired_figure(mine, base, key, evaluations) for key in keys]
+        yield name, [Cell(record.get(k), each, DIGITS.get(k, 3)) for k, each in zip(keys, changes, strict=True)]
 
 
 def _table(
@@ -81,24 +105,11 @@ def _table(
     shown = measured(records, keys)
     if not shown:
         return None
-    base, rows = comparison.base(), []
-    for record in records:
-        mine = comparison.of(record["method"], decoding_of(record))
-        cells = []
-        for key in shown:
-            found = None if mine == base else paired_figure(mine, base, key, evaluations)
-            digits = digits_of(key)
-            cells.append(joined([number(record.get(key), digits), quiet_change(found, digits)], ""))
-        rows.append([named(experiment, record, mine == base), *cells])
-    return table(["method", *(_title(key, keys[key]) for key in shown)], rows)
+    rows = safety_rows(experiment, comparison, records, shown, evaluations)
+    titles = ["method", *(_title(key, keys[key]) for key in shown)]
+    return table(titles, [[name, *map(with_change, cells)] for name, cells in rows])
 
 
 def _title(key: str, name: str) -> str:
     """With an arrow to where better values lie; more spread is neither better nor worse."""
     return name if key == "spread" else f"{name}\N{NO-BREAK SPACE}↓"
-
-
-def named(experiment: Experiment, record: Mapping[str, Any], is_base: bool) -> str:
-    """What a row is called: the reference, where it is not what others are compared with, by its decoding too."""
-    name = experiment.labels[record["method"]]
-    return name if is_base or record["method"] != REFERENCE else f"{name}, {in_words(decoding_of(record))}"
