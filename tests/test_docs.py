@@ -27,6 +27,7 @@ from dpa.report.text import (
     comparison_table,
     learnt_table,
     likelihood_table,
+    minute_table,
     safety_table,
     sharpness_table,
 )
@@ -341,6 +342,7 @@ def test_the_tables_of_the_results_are_those_of_the_studies_beside_them(study: S
             safety_table(experiment, experiment.own_best, evaluations),
             None if one else safety_table(experiment, experiment.at_common, evaluations),
             sharpness_table(experiment, evaluations),
+            minute_table(experiment),
             likelihood_table(experiment, evaluations) if experiment.likelihood else None,
             None if learnt is None else learnt_table(learnt),
         ]

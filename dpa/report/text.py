@@ -10,6 +10,7 @@ from dpa.report.findings import budgets, chosen_on_the_same, headline, left_out,
 from dpa.report.likelihoods import ABOUT_LEARNT, LEARNT, Learnt, likelihoods, shown_figures, who_learns
 from dpa.report.matched import ABOUT_SHARPNESS, SHARPNESS, sharpness_rows
 from dpa.report.paired import Cell
+from dpa.report.sections.compute import ABOUT_MINUTES, MINUTES, minute_rows
 from dpa.report.sections.safety import groups_of, safety_rows
 from dpa.report.statistics import Interval
 from dpa.report.study import Evaluations, Study
@@ -79,6 +80,9 @@ def _experiment(experiment: Experiment, evaluations: Evaluations) -> Iterator[st
     if told := sharpness_table(experiment, evaluations):
         yield f"**At equal sharpness** of sampling: {ABOUT_SHARPNESS}:"
         yield told
+    if took := minute_table(experiment):
+        yield f"**Minutes of one worker**, {ABOUT_MINUTES}:"
+        yield took
     if experiment.likelihood:
         if learnt := who_learns(experiment, evaluations):
             yield f"**Who learns the ranking** (table 3); {ABOUT_LEARNT}:"
@@ -156,6 +160,19 @@ def sharpness_table(experiment: Experiment, evaluations: Evaluations) -> str | N
     """
     rows = sharpness_rows(experiment, evaluations)
     return to_markdown(SHARPNESS, rows) if rows else None
+
+
+def minute_table(experiment: Experiment) -> str | None:
+    """Minutes of every method until each of its snapshots.
+
+    Args:
+        experiment: to tell of.
+
+    Returns:
+        Markdown; None where no snapshot was evaluated, or no time was kept.
+    """
+    rows = minute_rows(experiment)
+    return to_markdown(MINUTES, rows) if rows else None
 
 
 def likelihood_table(experiment: Experiment, evaluations: Evaluations) -> str:

@@ -27,7 +27,7 @@ from dpa.report.markup import (
 )
 from dpa.report.matched import ABOUT_SHARPNESS, SHARPNESS, matched_difference, reference_line, sharpness_rows
 from dpa.report.paired import paired_figure, quiet_change
-from dpa.report.sections.compute import compute_charts
+from dpa.report.sections.compute import ABOUT_MINUTES, MINUTES, compute_charts, minute_rows
 from dpa.report.sections.likelihood import likelihood_table
 from dpa.report.sections.origin import code_of
 from dpa.report.sections.safety import safety_tables
@@ -78,6 +78,7 @@ def experiment_section(experiment: Experiment, colours: Mapping[str, str], evalu
         *(element("p", note, class_="note") for note in notes),
         gallery([chart for chart in charts if chart is not None]),
         sharpness_table(experiment, evaluations),
+        minute_table(experiment),
         likelihood_table(experiment, evaluations),
         folded("command, configuration, versions and machine", _made(experiment)),
     ]
@@ -174,6 +175,16 @@ def sharpness_table(experiment: Experiment, evaluations: Evaluations) -> Html:
         return Html("")
     about = hint(f"On {experiment.reported}: {ABOUT_SHARPNESS}.")
     return joined([element("h3", "At equal sharpness of sampling"), table(SHARPNESS, rows), about])
+
+
+def minute_table(experiment: Experiment) -> Html:
+    """What methods took until each snapshot; nothing where none was evaluated."""
+    rows = minute_rows(experiment)
+    if not rows:
+        return Html("")
+    return joined(
+        [element("h3", "Minutes of one worker"), table(MINUTES, rows), hint(f"{ABOUT_MINUTES}.".capitalize())]
+    )
 
 
 def _reach(above: Sequence[Interval | None]) -> tuple[list[float], list[float]] | None:

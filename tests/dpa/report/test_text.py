@@ -155,6 +155,20 @@ def test_equal_sharpness_is_of_the_reported_scenes_for_every_method_at_its_best_
     assert {name: cells["Δ realism [95 %]"] for name, cells in table.items()} == expected
 
 
+def test_minutes_are_told_until_each_snapshot_where_snapshots_were_evaluated(text: str, runs: Path) -> None:
+    steps = read_experiment(runs / "experiments" / "steps.json")
+    table = rows_of(block(text, steps.title), "**Minutes of one worker**")
+    assert table.keys() == {steps.labels[method] for method in steps.compute}
+    taken = steps.own_best.steps
+    for method in steps.compute:
+        policies = sorted((m for m in steps.methods if m.partition("@")[0] == method), key=lambda m: taken[m])
+        until = ", ".join(f"{5 + 10 * taken[m] / 60:.1f}" for m in policies)
+        cells = table[steps.labels[method]]
+        assert (cells["before training"], cells["until each snapshot, all in all"]) == (["5.0"], [until])
+    methods = read_experiment(runs / "experiments" / "methods.json")
+    assert "**Minutes of one worker**" not in block(text, methods.title), "none of its snapshots was evaluated"
+
+
 def test_the_account_has_every_experiment_and_adds_up(text: str, runs: Path) -> None:
     titles, _, *lines = block(text, "Time of one worker").strip().splitlines()
     names = [cell.strip() for cell in titles.strip("|").split("|")]
