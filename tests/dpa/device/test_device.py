@@ -12,6 +12,7 @@ HERE = Path(__file__).parent
 CASES = sorted(HERE.glob("cases_*.py"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cases", CASES, ids=lambda path: path.stem.removeprefix("cases_"))
 def test_everything_stays_on_its_device_and_waits_for_it_where_it_is_said(cases: Path) -> None:
     command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", str(cases)]
