@@ -3,8 +3,9 @@
     python -m recipes.gains 'name=[competent,families]' 'runs=[runs/driving,runs/smart]' 'methods=[dpa_omf,rloo]'
 
 Of each comparison its reference, with family, tokens and size of its policy where that is there, and the gain of some
-methods, best decoding against best, with the intervals of the comparison itself. Nothing is run. ``gains.md`` beside
-the figure is the table for a document.
+methods, best decoding against best, with the intervals of the comparison itself; and these gains minus those of the
+first of the runs, where the scenes are the same. Nothing is run. ``gains.md`` beside the figure has the tables for a
+document.
 """
 
 from __future__ import annotations
@@ -12,13 +13,15 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import hydra
+from numpy.typing import NDArray
 from omegaconf import DictConfig, ListConfig
 
-from dpa.report.experiment import Comparison, Experiment, decoding_of, read_experiment
-from dpa.report.paired import scene_values
-from dpa.report.statistics import Interval, summary
+from dpa.report.experiment import Comparison, Experiment, decoding_of, read_experiment, read_json
+from dpa.report.paired import paired_values, scene_values
+from dpa.report.statistics import Interval, summary, unpaired_bootstrap
 from dpa.report.studies import plot_gains
 from dpa.report.study import Evaluations
 from dpa.report.table import to_markdown
@@ -64,6 +67,52 @@ def gain_of(comparison: Comparison, method: str) -> Interval:
     rows = comparison.of(method, decoding_of(entry))
     scenes = rows[0]["n_scenes"]
     return Interval(entry["realism_difference"], *entry["ci95"], entry["over"], entry["n_seeds"], scenes)
+
+
+class Gains(NamedTuple):
+    """Realism of a method minus that of its reference.
+
+    Attributes:
+        scenes: their names.
+        values: ``[seeds, scenes]``.
+    """
+
+    scenes: list[str]
+    values: NDArray
+
+
+def gains_by_scene(comparison: Comparison, method: str, folder: Path) -> Gains | None:
+    """The gain in every scene; None where the values of one are missing."""
+    rows = comparison.of(method, decoding_of(comparison.entry(method)))
+    both = paired_values(rows, comparison.base(), "realism", Evaluations(folder))
+    if both is None:
+        return None
+    scenes = read_json(folder / rows[0]["file"]).get("scenes", [])
+    return Gains(scenes, both[0] - both[1]) if len(scenes) == both.shape[-1] else None
+
+
+def less(found: Sequence[tuple[Path, Experiment]], methods: Sequence[str]) -> dict[str, list[Interval | None]]:
+    """Gains of all comparisons but the first minus those of the first, a row for each.
+
+    Args:
+        found: comparisons with their folders.
+        methods: whose gains, in order.
+
+    Returns:
+        By the name of the folder; None where a gain is not known in every scene, or is of other scenes.
+    """
+
+    def gains(folder: Path, experiment: Experiment) -> list[Gains | None]:
+        return [gains_by_scene(experiment.own_best, method, folder) for method in methods]
+
+    first, *others = (gains(*each) for each in found)
+    return {
+        folder.name: [
+            unpaired_bootstrap(mine.values, base.values) if mine and base and mine.scenes == base.scenes else None
+            for mine, base in zip(other, first, strict=True)
+        ]
+        for (folder, _), other in zip(found[1:], others, strict=True)
+    }
 
 
 def about(experiment: Experiment, folder: Path) -> list[Cell]:
@@ -118,21 +167,16 @@ def main(cfg: DictConfig) -> None:
         rows[name] = [*about(experiment, folder), str(len(experiment.seeds)), competence[name], *told]
     output.mkdir(parents=True, exist_ok=True)
     plot_gains(competence, gains, output / "gains.png")
-    columns = [
-        "runs",
-        "family",
-        "tokens",
-        "parameters [M]",
-        "seeds",
-        "realism of the reference",
-        *(f"gain of {each}" for each in labels.values()),
-    ]
     reported = ", ".join(dict.fromkeys(f"{each.reported} of {each.scenes['source']}" for _, each in found))
-    title = f"{reported}; best decoding against best"
-    table = StudyTable("gains", title, columns, rows, signed=False)
-    tell(cfg, [table], {"gains": output / "gains.png"})
-    (output / "gains.md").write_text(to_markdown(columns, table.printed()) + "\n", encoding="utf-8")
-    print(f"figure: {output / 'gains.png'}\ntable for a document: {output / 'gains.md'}")
+    columns = [f"gain of {label}" for label in labels.values()]
+    known = ["runs", "family", "tokens", "parameters [M]", "seeds", "realism of the reference"]
+    tables = [StudyTable("gains", f"{reported}; best decoding against best", [*known, *columns], rows, signed=False)]
+    if minus := less(found, methods):
+        tables.append(StudyTable("gains_minus_first", f"minus those of {found[0][0].name}", ["runs", *columns], minus))
+    tell(cfg, tables, {"gains": output / "gains.png"})
+    told = "\n\n".join(to_markdown(table.columns, table.printed()) for table in tables)
+    (output / "gains.md").write_text(told + "\n", encoding="utf-8")
+    print(f"figure: {output / 'gains.png'}\ntables for a document: {output / 'gains.md'}")
 
 
 if __name__ == "__main__":

@@ -101,6 +101,44 @@ def paired_bootstrap(
     return _bootstrap(mine - other, num_resamples, seed)
 
 
+def unpaired_bootstrap(values: ArrayLike, others: ArrayLike, num_resamples: int = 10_000, *, seed: int = 0) -> Interval:
+    """Mean of ``values`` minus that of ``others``, of other training runs on the same scenes, and its interval.
+
+    A resample draws the runs of either side for themselves, and scenes for both: what a scene does to both sides
+    cancels, what a run does to its own side does not.
+
+    Args:
+        values: ``[seeds, scenes]``.
+        others: ``[other seeds, scenes]``.
+        num_resamples: bootstrap draws.
+        seed: of the draws.
+
+    Returns:
+        The difference; ``num_seeds`` is that of the side with fewer runs, and of a single one the interval knows
+        nothing of the spread between them.
+
+    Raises:
+        ValueError: other numbers of scenes, no scene, or a value that is not finite.
+
+    Examples:
+        >>> unpaired_bootstrap([[0.2, 0.4], [0.4, 0.6]], [[0.1, 0.3], [0.1, 0.3], [0.1, 0.3]]).mean.__round__(3)
+        0.2
+    """
+    mine, theirs = _checked(values, "values"), _checked(others, "others")
+    if mine.shape[1] != theirs.shape[1]:
+        raise ValueError(
+            f"values {list(mine.shape)} and others {list(theirs.shape)} must have the same scenes in the same order."
+        )
+    num_seeds, num_scenes = min(len(mine), len(theirs)), mine.shape[1]
+    rng = np.random.default_rng(seed)
+    scenes = _counts(rng, num_scenes, num_resamples)
+    means = [
+        np.einsum("rk,kn,rn->r", _counts(rng, len(side), num_resamples), side, scenes, optimize=True) / side.size
+        for side in (mine, theirs)
+    ]
+    return interval_of(float(mine.mean() - theirs.mean()), means[0] - means[1], num_seeds, num_scenes)
+
+
 def summary(values: ArrayLike) -> Interval:
     """Mean of one method and its interval, resampled like :func:`paired_bootstrap`.
 
@@ -249,8 +287,13 @@ def _draws(num_seeds: int, num_scenes: int, num_resamples: int, seed: int) -> It
     rng, chunk = np.random.default_rng(seed), max(1, _COUNTS_AT_ONCE // num_scenes)
     for done in range(0, num_resamples, chunk):
         draws = min(chunk, num_resamples - done)
-        scenes = rng.multinomial(num_scenes, np.full(num_scenes, 1 / num_scenes), size=draws)
-        yield rng.multinomial(num_seeds, np.full(num_seeds, 1 / num_seeds), size=draws), scenes
+        scenes = _counts(rng, num_scenes, draws)
+        yield _counts(rng, num_seeds, draws), scenes
+
+
+def _counts(rng: np.random.Generator, of: int, draws: int) -> NDArray[np.int64]:
+    """How often each of some units was drawn when as many were drawn with replacement, ``[draws, of]``."""
+    return rng.multinomial(of, np.full(of, 1 / of), size=draws)
 
 
 @lru_cache(maxsize=4)

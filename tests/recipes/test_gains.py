@@ -35,7 +35,7 @@ def test_the_table_has_the_differences_of_the_comparisons_and_the_realism_of_the
     outcome = run("gains", *told(studies, tmp_path))
     assert outcome.status == 0, outcome.err
     assert (tmp_path / "gains.png").is_file() and "first" in outcome.out and "second" in outcome.out
-    (table,) = (tmp_path / "tables").rglob("*.csv")
+    (table,) = (tmp_path / "tables/gains").rglob("*.csv")
     rows = {row["runs"]: row for row in csv.DictReader(table.read_text(encoding="utf-8").splitlines())}
     content = json.loads((studies[0] / "experiments/methods.json").read_text())
     (entry,) = [each for each in content["own_best"]["paired"] if each["method"] == "dpa_omf"]
@@ -53,6 +53,33 @@ def test_each_of_the_runs_may_have_an_experiment_of_its_own(run: Callable, studi
     assert outcome.status == 0 and "first" in outcome.out and "third" in outcome.out, outcome.err
 
 
+def test_gains_stand_beside_those_of_the_first_where_the_scenes_are_the_same(
+    run: Callable, studies: list[Path], tmp_path: Path
+) -> None:
+    better = tmp_path / "better"
+    shutil.copytree(studies[0], better)
+    content = json.loads((better / "experiments/methods.json").read_text())
+    for file in {row["file"] for row in content["own_best"]["rows"] if row["method"] == "dpa_omf"}:
+        values = json.loads((better / file).read_text())
+        values["per_scene"]["realism"] = [each + 0.125 for each in values["per_scene"]["realism"]]
+        (better / file).write_text(json.dumps(values))
+    elsewhere = tmp_path / "elsewhere"
+    shutil.copytree(studies[0], elsewhere)
+    for file in elsewhere.rglob("*.json"):
+        values = json.loads(file.read_text())
+        if "scenes" in values and "per_scene" in values:
+            file.write_text(json.dumps(values | {"scenes": [f"{name}, of another town" for name in values["scenes"]]}))
+    outcome = run("gains", *told([studies[0], better, elsewhere], tmp_path / "out"))
+    assert outcome.status == 0, outcome.err
+    (table,) = (tmp_path / "out/tables/gains_minus_first").rglob("*.csv")
+    rows = {row["runs"]: row for row in csv.DictReader(table.read_text(encoding="utf-8").splitlines())}
+    assert rows.keys() == {"better", "elsewhere"}
+    gained = [float(rows["better"][f"gain of DPA-OMF{end}"]) for end in ("", " low", " high")]
+    assert gained[0] == pytest.approx(0.125) and gained[1] <= 0.125 <= gained[2]
+    assert float(rows["better"]["gain of adversarial AFD"]) == pytest.approx(0)
+    assert rows["elsewhere"]["gain of DPA-OMF"] == "", "nothing can be said across scenes"
+
+
 def test_an_archive_tells_family_tokens_and_size_of_a_reference_of_the_zoo(run: Callable, tmp_path: Path) -> None:
     write_experiment(tmp_path / "runs", "methods", METHODS)
     path = tmp_path / "runs/experiments/methods.json"
@@ -61,11 +88,11 @@ def test_an_archive_tells_family_tokens_and_size_of_a_reference_of_the_zoo(run: 
     path.write_text(json.dumps(content))
     outcome = run("gains", *told([tmp_path / "runs"], tmp_path / "out"))
     assert outcome.status == 0, outcome.err
-    (table,) = (tmp_path / "out/tables").rglob("*.csv")
+    (table,) = (tmp_path / "out/tables/gains").rglob("*.csv")
     (row,) = csv.DictReader(table.read_text(encoding="utf-8").splitlines())
     assert float(row["parameters [M]"]) == pytest.approx(0.15, abs=0.01)
     assert (row["family"], row["tokens"]) == ("motionlm", "verlet, 169")
-    titles, _, line = (tmp_path / "out/gains.md").read_text(encoding="utf-8").splitlines()
+    titles, _, line = (tmp_path / "out/gains.md").read_text(encoding="utf-8").partition("\n\n")[0].splitlines()
     assert titles.startswith("| runs | family | tokens |") and line.startswith("| runs | motionlm | verlet, 169 |")
 
 

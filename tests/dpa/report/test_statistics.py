@@ -9,7 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dpa.report.statistics import SCENES, SEEDS_AND_SCENES, compare_methods, paired_bootstrap, summary
+from dpa.report.statistics import (
+    SCENES,
+    SEEDS_AND_SCENES,
+    compare_methods,
+    paired_bootstrap,
+    summary,
+    unpaired_bootstrap,
+)
 
 
 def simulated(
@@ -91,6 +98,29 @@ def test_the_interval_holds_the_true_gain_about_as_often_as_it_says(seeds: int, 
 def test_how_often_few_runs_hold_the_true_gain_is_as_documented(seeds: int, scenes: int, told: float) -> None:
     assert f"{told:.0%}".replace("%", " %") in " ".join(str(paired_bootstrap.__doc__).split())
     assert coverage(seeds, 0.01, trials=2000, num_scenes=scenes) == pytest.approx(told, abs=0.01)
+
+
+def test_runs_that_are_not_paired_are_drawn_for_themselves_and_scenes_for_both() -> None:
+    rng = np.random.default_rng(7)
+    mine, theirs = simulated(rng, 4, 0.02), simulated(rng, 3, 0.01)
+    found = unpaired_bootstrap(mine, theirs)
+    draws = []
+    for _ in range(4000):  # the same, drawn one by one
+        scenes = rng.integers(54, size=54)
+        one, other = mine[rng.integers(4, size=4)][:, scenes], theirs[rng.integers(3, size=3)][:, scenes]
+        draws.append(one.mean() - other.mean())
+    assert found.mean == pytest.approx(mine.mean() - theirs.mean())
+    assert (found.low, found.high) == pytest.approx(tuple(np.quantile(draws, [0.025, 0.975])), abs=0.002)
+    assert (found.num_seeds, found.num_scenes, found.over) == (3, 54, SEEDS_AND_SCENES)
+
+
+def test_what_a_scene_does_to_both_sides_cancels_and_one_run_of_a_side_carries_no_claim() -> None:
+    scene = np.random.default_rng(8).normal(0, 0.1, (1, 60))
+    found = unpaired_bootstrap(np.repeat(scene + 0.25, 2, 0), scene)
+    assert (found.mean, found.low, found.high) == pytest.approx((0.25, 0.25, 0.25))
+    assert found.over == SCENES and found.verdict == "open"
+    with pytest.raises(ValueError, match=r"values \[1, 60\] and others \[1, 59\] must have the same scenes"):
+        unpaired_bootstrap(scene, scene[:, :59])
 
 
 def test_one_seed_knows_nothing_of_the_spread_between_runs() -> None:
