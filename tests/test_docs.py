@@ -497,18 +497,18 @@ RUNGS = {
 
 def test_the_table_of_the_simulator_is_of_the_ladder_beside_it() -> None:
     with zipfile.ZipFile(REPOSITORY / "docs/studies/ladder.zip") as archive:
-        ladder = json.loads(archive.read("ladder/ladder.json"))["rungs"]
+        files = {rung: archive.read(f"ladder/{rung.replace(' ', '_')}.json") for rung in RUNGS.values()}
     page = (REPOSITORY / "docs/studies/metric.md").read_text(encoding="utf-8")
     section = page.partition("## What the simulator itself gets")[2].partition("\n## ")[0]
     measures = ("kinematic", "interactive", "map_based", "min_ade", "collision_rate", "offroad_rate", "spread")
     for row, rung in RUNGS.items():
         (told,) = re.findall(rf"^\| {re.escape(row)} \| (.*) \|$", section, re.MULTILINE)
         realism, *others = told.split(" | ")
-        values = ladder[rung]["2024"]
-        found = summary([values["realism"]])
+        values = [scene["2024"] for scene in json.loads(files[rung])["per_scene"]]
+        found = summary([[scene["realism"] for scene in values]])
         assert realism == f"{found.mean:.3f} [{found.low:.3f}, {found.high:.3f}]", row
         for measure, cell in zip(measures, others, strict=True):
-            known = [value for value in values[measure] if value is not None]
+            known = [scene[measure] for scene in values if scene[measure] is not None]
             digits = len(cell.partition(".")[2])
             assert cell == f"{sum(known) / len(known):.{digits}f}", (row, measure)
 
