@@ -13,7 +13,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import hydra
 from numpy.typing import NDArray
@@ -69,28 +68,6 @@ def gain_of(comparison: Comparison, method: str) -> Interval:
     return Interval(entry["realism_difference"], *entry["ci95"], entry["over"], entry["n_seeds"], scenes)
 
 
-class Gains(NamedTuple):
-    """Realism of a method minus that of its reference.
-
-    Attributes:
-        scenes: their names.
-        values: ``[seeds, scenes]``.
-    """
-
-    scenes: list[str]
-    values: NDArray
-
-
-def gains_by_scene(comparison: Comparison, method: str, folder: Path) -> Gains | None:
-    """The gain in every scene; None where the values of one are missing."""
-    rows = comparison.of(method, decoding_of(comparison.entry(method)))
-    both = paired_values(rows, comparison.base(), "realism", Evaluations(folder))
-    if both is None:
-        return None
-    scenes = read_json(folder / rows[0]["file"]).get("scenes", [])
-    return Gains(scenes, both[0] - both[1]) if len(scenes) == both.shape[-1] else None
-
-
 def less(found: Sequence[tuple[Path, Experiment]], methods: Sequence[str]) -> dict[str, list[Interval | None]]:
     """Gains of all comparisons but the first minus those of the first, a row for each.
 
@@ -102,16 +79,22 @@ def less(found: Sequence[tuple[Path, Experiment]], methods: Sequence[str]) -> di
         By the name of the folder; None where a gain is not known in every scene, or is of other scenes.
     """
 
-    def gains(folder: Path, experiment: Experiment) -> list[Gains | None]:
-        return [gains_by_scene(experiment.own_best, method, folder) for method in methods]
+    def gains(folder: Path, comparison: Comparison) -> tuple[list[str], list[NDArray | None]]:
+        """Names of the scenes, and of each method its gain ``[seeds, scenes]``."""
+        evaluations, base = Evaluations(folder), comparison.base()
+        rows = [comparison.of(method, decoding_of(comparison.entry(method))) for method in methods]
+        both = [paired_values(mine, base, "realism", evaluations) for mine in rows]
+        scenes = read_json(folder / base[0]["file"]).get("scenes", [])
+        known = [values is not None and values.shape[-1] == len(scenes) for values in both]
+        return scenes, [each[0] - each[1] if told else None for each, told in zip(both, known, strict=True)]
 
-    first, *others = (gains(*each) for each in found)
+    (named, first), *others = (gains(folder, experiment.own_best) for folder, experiment in found)
     return {
         folder.name: [
-            unpaired_bootstrap(mine.values, base.values) if mine and base and mine.scenes == base.scenes else None
+            None if scenes != named or mine is None or base is None else unpaired_bootstrap(mine, base)
             for mine, base in zip(other, first, strict=True)
         ]
-        for (folder, _), other in zip(found[1:], others, strict=True)
+        for (folder, _), (scenes, other) in zip(found[1:], others, strict=True)
     }
 
 

@@ -129,14 +129,13 @@ def unpaired_bootstrap(values: ArrayLike, others: ArrayLike, num_resamples: int 
         raise ValueError(
             f"values {list(mine.shape)} and others {list(theirs.shape)} must have the same scenes in the same order."
         )
-    num_seeds, num_scenes = min(len(mine), len(theirs)), mine.shape[1]
-    rng = np.random.default_rng(seed)
-    scenes = _counts(rng, num_scenes, num_resamples)
-    means = [
-        np.einsum("rk,kn,rn->r", _counts(rng, len(side), num_resamples), side, scenes, optimize=True) / side.size
-        for side in (mine, theirs)
+    num_scenes = mine.shape[1]
+    resampled = [
+        _means(mine, ours, scenes) - _means(theirs, yours, scenes)
+        for scenes, ours, yours in _draws((num_scenes, len(mine), len(theirs)), num_resamples, seed)
     ]
-    return interval_of(float(mine.mean() - theirs.mean()), means[0] - means[1], num_seeds, num_scenes)
+    num_seeds = min(len(mine), len(theirs))
+    return interval_of(float(mine.mean() - theirs.mean()), np.concatenate(resampled), num_seeds, num_scenes)
 
 
 def summary(values: ArrayLike) -> Interval:
@@ -179,12 +178,16 @@ def resampled_means(values: ArrayLike, num_resamples: int = 10_000, *, seed: int
     values = np.asarray(values, dtype=np.float64)
     _, num_seeds, num_scenes = values.shape
     drawn = _kept_draws if num_resamples * num_scenes <= _COUNTS_KEPT else _draws
-    # Drawing rows and columns is the same as weighting them, so that means are products of counts.
     means = [
-        [np.einsum("rk,kn,rn->r", seeds, measure, scenes, optimize=True) / measure.size for measure in values]
-        for seeds, scenes in drawn(num_seeds, num_scenes, num_resamples, seed)
+        [_means(measure, seeds, scenes) for measure in values]
+        for scenes, seeds in drawn((num_scenes, num_seeds), num_resamples, seed)
     ]
     return np.concatenate(means, axis=1)
+
+
+def _means(values: NDArray[np.float64], seeds: NDArray, scenes: NDArray) -> NDArray[np.float64]:
+    """Of ``[seeds, scenes]`` in every resample: drawing rows and columns is weighting them by their counts."""
+    return np.einsum("rk,kn,rn->r", seeds, values, scenes, optimize=True) / values.size
 
 
 def compare_methods(
@@ -282,21 +285,21 @@ def interval_of(mean: float, resampled: NDArray[np.float64], num_seeds: int, num
     return Interval(mean, float(low), float(high), over, num_seeds, num_scenes)
 
 
-def _draws(num_seeds: int, num_scenes: int, num_resamples: int, seed: int) -> Iterator[tuple[NDArray, NDArray]]:
-    """How often each seed and each scene was drawn in each resample, ``[draws, seeds]`` and ``[draws, scenes]``."""
-    rng, chunk = np.random.default_rng(seed), max(1, _COUNTS_AT_ONCE // num_scenes)
+def _draws(units: tuple[int, ...], num_resamples: int, seed: int) -> Iterator[list[NDArray[np.int64]]]:
+    """How often each of several kinds of units was drawn in each resample, ``[draws, units]`` of each kind.
+
+    Args:
+        units: how many there are of each kind, scenes first: they are the most, and bound what is held at one time.
+        num_resamples: in all.
+        seed: of the draws.
+    """
+    rng, chunk = np.random.default_rng(seed), max(1, _COUNTS_AT_ONCE // units[0])
     for done in range(0, num_resamples, chunk):
         draws = min(chunk, num_resamples - done)
-        scenes = _counts(rng, num_scenes, draws)
-        yield _counts(rng, num_seeds, draws), scenes
-
-
-def _counts(rng: np.random.Generator, of: int, draws: int) -> NDArray[np.int64]:
-    """How often each of some units was drawn when as many were drawn with replacement, ``[draws, of]``."""
-    return rng.multinomial(of, np.full(of, 1 / of), size=draws)
+        yield [rng.multinomial(of, np.full(of, 1 / of), size=draws) for of in units]
 
 
 @lru_cache(maxsize=4)
-def _kept_draws(*shape: int) -> list[tuple[NDArray, NDArray]]:
+def _kept_draws(units: tuple[int, ...], num_resamples: int, seed: int) -> list[list[NDArray[np.int64]]]:
     """A page has hundreds of intervals over the same seeds and scenes, and the same draws serve them all."""
-    return list(_draws(*shape))
+    return list(_draws(units, num_resamples, seed))

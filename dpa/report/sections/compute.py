@@ -15,7 +15,7 @@ MINUTES = ("method", "before training", "until each snapshot, all in all")
 ABOUT_MINUTES = "one job at a time, means over seeds; what comes before training is rolling out and ranking"
 
 
-class Path(NamedTuple):
+class Course(NamedTuple):
     """What a method gained, and when.
 
     Attributes:
@@ -31,7 +31,7 @@ class Path(NamedTuple):
     found: list[Mapping[str, Any]]
 
 
-def paths(experiment: Experiment) -> Iterator[Path]:
+def courses(experiment: Experiment) -> Iterator[Course]:
     """The methods of which it is known what they took, in their order.
 
     Args:
@@ -45,7 +45,7 @@ def paths(experiment: Experiment) -> Iterator[Path]:
         # A snapshot has taken its share of the training, and all that came before it.
         shares = [comparison.steps[entry["method"]] / spent["steps"] for entry in found]
         minutes = [(spent["before"] + share * spent["training"]) / 60 for share in shares]
-        yield Path(base, spent["before"] / 60, minutes, found)
+        yield Course(base, spent["before"] / 60, minutes, found)
 
 
 def compute_charts(experiment: Experiment, colours: Mapping[str, str]) -> list[Chart]:
@@ -56,7 +56,7 @@ def compute_charts(experiment: Experiment, colours: Mapping[str, str]) -> list[C
         colours: of its methods.
     """
     content = []
-    for method, _, minutes, found in paths(experiment):
+    for method, _, minutes, found in courses(experiment):
         gains = [entry["realism_difference"] for entry in found]
         hover = [
             lines(experiment.labels[entry["method"]], *told(entry), f"{number(each, 1)} minutes")
@@ -78,10 +78,14 @@ def minute_rows(experiment: Experiment) -> list[list[str]]:
     Args:
         experiment: to tell of.
     """
-    known = list(paths(experiment))
-    if all(len(path.found) < 2 for path in known):
+    known = list(courses(experiment))
+    if all(len(course.found) < 2 for course in known):
         return []
     return [
-        [experiment.labels[path.method], number(path.before, 1), ", ".join(number(each, 1) for each in path.minutes)]
-        for path in known
+        [
+            experiment.labels[course.method],
+            number(course.before, 1),
+            ", ".join(number(each, 1) for each in course.minutes),
+        ]
+        for course in known
     ]
