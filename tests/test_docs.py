@@ -318,14 +318,6 @@ def holds(archive: Path, beginning: str) -> bool:
     return any(each.startswith(beginning) for each in zipfile.ZipFile(archive).namelist())
 
 
-@pytest.mark.parametrize("archive", STUDIES, ids=lambda path: path.stem)
-def test_an_archive_tells_of_no_folder_of_the_machine_that_made_it(archive: Path) -> None:
-    with zipfile.ZipFile(archive) as content:
-        told = {each: content.read(each) for each in content.namelist() if each.endswith(".json")}
-    folders = re.compile(rb"/(?:data|home|mnt|opt|root|tmp|Users|work)/[^ \"']*")
-    assert not {each: found for each, text in told.items() if (found := folders.findall(text))}
-
-
 COMPARED = [path for path in STUDIES if holds(path, "experiments/")]
 """Those of comparisons of methods; the others are of rankings alone."""
 

@@ -8,8 +8,10 @@ import shutil
 import subprocess
 import sys
 import tomllib
+import zipfile
 from collections.abc import Iterator
 from importlib.metadata import packages_distributions
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -23,7 +25,9 @@ REGISTRIES = [".".join(parts) for parts in [
     ("pypi", "org"), ("pythonhosted", "org"), ("download", "pytorch", "org"), ("anaconda", "com"), ("anaconda", "org"),
     ("npmjs", "org"), ("npmjs", "com"), ("unpkg", "com"), ("jsdelivr", "net"), ("crates", "io"),
 ]]  # fmt: skip
-MACHINE_PATH = re.compile(r"(?<![\w.*~])/(?:" + "|".join(["work", "root"]) + r")(?![\w-])")
+MACHINE_PATH = re.compile(
+    r"(?<![\w.*~])/(?:" + "|".join(["data", "home", "mnt", "opt", "root", "tmp", "Users", "work"]) + r")(?![\w-])"
+)
 
 
 def repository_files() -> list[Path]:
@@ -48,6 +52,15 @@ def texts() -> Iterator[tuple[str, str]]:
             yield str(path.relative_to(REPOSITORY)), content.decode()
 
 
+def archived() -> Iterator[tuple[str, str]]:
+    """Name and text of every file in an archive."""
+    for path in repository_files():
+        if path.suffix == ".zip":
+            with zipfile.ZipFile(path) as archive:
+                for name in archive.namelist():
+                    yield f"{path.relative_to(REPOSITORY)}/{name}", archive.read(name).decode()
+
+
 def modules() -> Iterator[tuple[str, str, ast.Module]]:
     """Name, text and syntax tree of every Python file."""
     for name, text in texts():
@@ -56,12 +69,13 @@ def modules() -> Iterator[tuple[str, str, ast.Module]]:
 
 
 def test_no_file_names_a_package_registry() -> None:
-    found = [f"{name}: {host}" for name, text in texts() for host in REGISTRIES if host in text]
+    found = [f"{name}: {host}" for name, text in chain(texts(), archived()) for host in REGISTRIES if host in text]
     assert not found
 
 
 def test_no_file_names_a_path_of_one_machine() -> None:
-    found = [f"{name}: {match[0]}" for name, text in texts() for match in MACHINE_PATH.finditer(text)]
+    everywhere = chain(texts(), archived())
+    found = [f"{name}: {match[0]}" for name, text in everywhere for match in MACHINE_PATH.finditer(text)]
     assert not found
 
 
