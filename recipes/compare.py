@@ -23,7 +23,7 @@ from omegaconf import DictConfig
 from dpa.models import Decoding
 from dpa.report.experiment import read_experiment, read_json
 from dpa.report.table import REFERENCE, print_table
-from envs.files import write_json
+from envs.files import alone_in, write_json
 from recipes.alignment.data import ON_POLICY
 from recipes.common.cli import CONFIG, recipe
 from recipes.common.provenance import merged, provenance
@@ -47,8 +47,8 @@ from recipes.experiment.methods import checkpoints_of, kept, levels, policies_of
 from recipes.experiment.pictures import write_players
 from recipes.experiment.pool import Workers
 from recipes.experiment.runs import Run
-from recipes.experiment.stages import Stages, alone_in
-from recipes.experiment.summary import Chosen, chosen_in, summarise_experiment
+from recipes.experiment.stages import Stages
+from recipes.experiment.summary import Chosen, chosen_in, decoding_at, summarise_experiment
 from recipes.report import report
 
 
@@ -124,7 +124,7 @@ def choose(cfg: DictConfig, stages: Stages) -> Chosen:
     runs = {method: [Run(*each) for each in product(among, decodings(cfg))] for method, among in policies.items()}
     tuned = {run for among in runs.values() if len(among) > 1 for run in among}
     stages.run("tune", evaluate_job, cfg, jobs_of(cfg, tuned, "tune"))
-    common = Decoding(*cfg.decoding.common)
+    common = decoding_at(cfg.decoding.common)
 
     def best(among: Sequence[Run]) -> Run:
         return max(among, key=lambda run: tuning_realism(cfg, run)) if len(among) > 1 else among[0]
@@ -152,7 +152,7 @@ def measure(cfg: DictConfig, stages: Stages, chosen: Chosen) -> None:
 
 def decodings(cfg: DictConfig) -> list[Decoding]:
     """The grid that decodings are chosen from."""
-    return [Decoding(*each) for each in cfg.decoding.grid]
+    return [decoding_at(each) for each in cfg.decoding.grid]
 
 
 def jobs_of(cfg: DictConfig, runs: Iterable[Run], split: str) -> list[tuple[int, str, str, float, float]]:

@@ -164,6 +164,8 @@ def _read_seeds(path: Path) -> dict[int, _Evaluation]:
 
 
 def _measures(mine: Rows, base: Rows, evaluations: Evaluated) -> Iterator[Difference]:
+    both_have = {row["seed"] for row in mine} & {row["seed"] for row in base}
+    mine, base = ([row for row in rows if row["seed"] in both_have] for rows in (mine, base))
     measures = evaluations(mine[0]["file"]) if mine else None
     for measure in measures or ():
         both = paired_values(mine, base, measure, evaluations)

@@ -1,6 +1,6 @@
 """What alignment gains against how good its reference is: finished comparisons side by side.
 
-    python -m recipes.gains 'name=[competent,families]' 'runs=[runs/driving,runs/smart]' 'methods=[dpa_omf,rloo]'
+    python -m recipes.gains 'name=[competent,families]' 'runs=[runs/driving,runs/smart]' 'methods=[dpa_omf]'
 
 Of each comparison its reference, with family, tokens and size of its policy where that is there, and the gain of some
 methods, best decoding against best, with the intervals of the comparison itself; and these gains minus those of the

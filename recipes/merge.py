@@ -24,7 +24,6 @@ from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
-from dpa.models import Decoding
 from dpa.report.archive import files_of
 from dpa.report.cards import KEPT, read_preference_cards
 from dpa.report.experiment import Experiment, decoding_of, read_experiment, read_json
@@ -39,14 +38,22 @@ from recipes.experiment.logged import log_experiment
 from recipes.experiment.pool import Job
 from recipes.experiment.runs import Run, RunFolder
 from recipes.experiment.stages import Stages, origins_beside, read_account
-from recipes.experiment.summary import Chosen, chosen_in, policy_of, summarise_experiment
+from recipes.experiment.summary import Chosen, chosen_in, decoding_at, policy_of, summarise_experiment
 
-METHODS = ("methods", "rankings", "experiment.setup", "experiment.labels", "experiment.published")
+METHODS = (
+    "methods",
+    "rankings",
+    "experiment.setup",
+    "experiment.labels",
+    "experiment.published",
+    "experiment.axis.values",
+)
 """Options by method or by ranking: parts agree in those that they share."""
 APART = (
     "seeds", "reference", "trained", "output", "only", "scenes", "threads", "workers", "device", "logger", "pictures",
     "decoding.grid", "decoding.chosen", "alignment.snapshots", "alignment.workers", "alignment.memory",
-    "alignment.max_rows", "alignment.checkpoint_interval", "collection.memory", "evaluation.memory",
+    "alignment.max_rows", "alignment.checkpoint_interval", "collection.workers", "collection.memory",
+    "collection.compile", "collection.chunk_scenes", "evaluation.memory",
     "experiment.name", "experiment.title", "experiment.question", "experiment.paper", "experiment.headline",
     "experiment.versus", "experiment.axis",
 )  # fmt: skip
@@ -140,7 +147,9 @@ def merged_config(parts: Sequence[Part], output: Path, trained: Path | None) -> 
         raise ValueError(f"--trained {trained}: these parts have trained their policies themselves; leave it out.")
     cfg = OmegaConf.create(dict(parts[0].found.config))
     for each in METHODS:
-        OmegaConf.update(cfg, each, _first(_select(part.found.config, each) for part in parts), merge=False)
+        if OmegaConf.select(cfg, each) is not None:
+            OmegaConf.update(cfg, each, _first(_select(part.found.config, each) for part in parts), merge=False)
+    cfg.logger.backend, cfg.logger.mode = "csv", "offline"  # what a part logged to need not be on this machine
     starts = _first(map(_references, parts))
     cfg.seeds = sorted(starts)
     cfg.reference = None if None in starts.values() else [starts[seed] for seed in cfg.seeds]
@@ -239,14 +248,16 @@ def _shared(config: Mapping[str, Any]) -> dict[str, Any]:
     unused = () if config["reference"] is None else ("pretraining",)
     for name in (*APART, *METHODS, *unused):
         section, _, key = name.rpartition(".")
-        (OmegaConf.select(kept, section) if section else kept).pop(key, None)
+        holder = OmegaConf.select(kept, section) if section else kept
+        if holder is not None:
+            holder.pop(key, None)
     return OmegaConf.to_container(kept)
 
 
-def _select(config: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+def _select(config: Mapping[str, Any] | None, name: str) -> Mapping[str, Any]:
     for key in name.split("."):
-        config = config[key]
-    return config
+        config = {} if config is None else config.get(key, {})
+    return {} if config is None else config
 
 
 def _gather(parts: Sequence[Part], runs: RunFolder) -> None:
@@ -295,7 +306,7 @@ def _take(file: Path, place: Path, part: Part) -> None:
 def _check_whole(cfg: DictConfig, chosen: Chosen) -> None:
     """Every result that the tables are made of is there, of scenes that are called alike."""
     runs, split, called = runs_of(cfg), cfg.experiment.split, {}
-    grid = {Run(REFERENCE, Decoding(*each)) for each in cfg.decoding.grid}
+    grid = {Run(REFERENCE, decoding_at(each)) for each in cfg.decoding.grid}
     for seed in cfg.seeds:
         needed = [runs.evaluation(seed, run, split) for run in {*chosen.common.values(), *chosen.best.values(), *grid}]
         needed += [runs.likelihood(seed, run.policy, split) for run in chosen.best.values()]

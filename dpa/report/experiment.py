@@ -108,8 +108,8 @@ class Experiment:
         likelihood: rows ``{"method", "seed", "file"}`` and figures of likelihood, on the reported scenes.
         axis: of a scaling experiment.
         curves: run folders by method and seed, relative to the folder of the study.
-        budget: for each method that is trained the optimiser ``steps`` of one run, the ``rollouts`` read in them, and
-            the policy it ``start``s from; a further round counts those before it.
+        budget: for each method that is trained the ``steps`` of one run (GRPO updates several times in one), the
+            ``rollouts`` read in them, and the policy it ``start``s from; a further round counts those before it.
         compute: seconds of one run of a method, ``before`` its training and in the ``steps`` of ``training``; empty of
             older results.
         stages: worker-seconds of its own jobs, by stage.

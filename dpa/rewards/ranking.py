@@ -24,10 +24,10 @@ class RealismRanking:
     depends on the rollouts that it is ranked among.
 
     Args:
-        metric: year of the realism metric.
+        metric: year of the realism metric, or a file of one's own (``.yaml``).
 
     Raises:
-        FileNotFoundError: there is no such metric.
+        ValueError: there is no such metric.
 
     Examples:
         >>> from dpa.ranking import log_trajectory
@@ -45,8 +45,9 @@ class RealismRanking:
         judge(self.metric)
 
     def describe(self) -> dict[str, Any]:
-        """The options that decide a ranking, ready for JSON."""
-        return {"kind": "realism", **asdict(self)}
+        """The options that decide a ranking, ready for JSON; of a metric in a file its content as well."""
+        own = {"digest": judge(self.metric).digest} if self.metric.endswith(".yaml") else {}
+        return {"kind": "realism", **asdict(self), **own}
 
     def __call__(self, scene: Scene, trajectories: Tensor, controlled: Tensor | None = None) -> Ranking:
         """Rank rollouts of one scene (arguments of :meth:`~dpa.ranking.PreferenceDistance.__call__`).

@@ -61,13 +61,7 @@ class RolloutCollector(BaseCollector):
     ) -> None:
         super().__init__()
         self.job, self.workers, self.max_staleness = job, workers or Workers(), max_staleness
-        if max_staleness < 0:
-            raise ValueError(f"staleness must be 0 or more, got {max_staleness}.")
-        if max_staleness > 0 and self.workers.backend == "local":
-            raise ValueError(
-                f"staleness={max_staleness} needs workers that roll out while the caller goes on, got backend=local; "
-                "say backend=process, or staleness=0."
-            )
+        check_staleness(max_staleness, self.workers)
         self._tasks, self._known, self._next, self.staleness = dict(enumerate(tasks)), len(tasks), 0, 0
         self._weights: Mapping[str, Tensor] | None = None
         self._crew: Crew | None = None
@@ -293,6 +287,21 @@ def make_collector(
     )
     tasks = plan_tasks(agents_of(scenes, indices, options), num_rollouts, rows_within(memory, model), done)
     return RolloutCollector(job, tasks, workers)
+
+
+def check_staleness(most: int, workers: Workers) -> None:
+    """Refuse a bound on staleness below 0, or one above 0 of workers that cannot go on while the caller learns.
+
+    Raises:
+        ValueError: it is such.
+    """
+    if most < 0:
+        raise ValueError(f"staleness must be 0 or more, got {most}.")
+    if most > 0 and workers.backend == "local":
+        raise ValueError(
+            f"staleness={most} needs workers that roll out while the caller goes on, got backend=local; "
+            "say backend=process, or staleness=0."
+        )
 
 
 def rows_within(memory: float, model: MotionModel) -> int:

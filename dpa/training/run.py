@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Literal
 
 from dpa.training.checkpoint import Checkpointer, Stateful, capture, restore
 from dpa.training.distributed import ALONE, Ranks
 from dpa.training.loggers import Backend, make_logger, read_curve
+from envs.files import alone_in
 from envs.options import differences
 from envs.progress import progress
 
@@ -64,7 +66,8 @@ class Run:
             alone writes files and shows progress.
 
     Raises:
-        ValueError: the folder holds a run with other options, or ranks do not see the same folder.
+        ValueError: the folder holds a run with other options, another process trains there, or ranks do not see the
+            same folder.
 
     Examples:
         >>> import tempfile
@@ -101,15 +104,20 @@ class Run:
         """Plain values that are kept in every checkpoint, for the recipe's own use."""
         self._spent = 0.0
         self._checkpoints = Checkpointer(self.folder / "checkpoints", config=config)
-        _refuse_other_options(self.folder, config)
-        saved = self._checkpoints.latest()
-        if saved is not None:
-            restore(saved, parts)
-            self.state, self._spent = dict(saved["progress"]["recipe"]), saved["progress"]["seconds"]
-        step = None if saved is None else saved["step"]
-        self.first_step = ranks.agree(step or 0, "a checkpoint of step", self.folder)
-        self._logger = make_logger(backend, self.folder, config, resume_step=step, mode=mode) if ranks.main else None
-        self._step = self.first_step
+        with ExitStack() as held:
+            if ranks.main:
+                held.enter_context(alone_in(self.folder))
+            _refuse_other_options(self.folder, config)
+            saved = self._checkpoints.latest()
+            if saved is not None:
+                restore(saved, parts)
+                self.state, self._spent = dict(saved["progress"]["recipe"]), saved["progress"]["seconds"]
+            step = None if saved is None else saved["step"]
+            self.first_step = self._step = ranks.agree(step or 0, "a checkpoint of step", self.folder)
+            self._logger = None
+            if ranks.main:
+                self._logger = make_logger(backend, self.folder, config, resume_step=step, mode=mode)
+            self._held = held.pop_all()
 
     def steps(self) -> Iterator[int]:
         """Steps that are left, counted from 0; saves a checkpoint after every interval and after the last one.
@@ -150,5 +158,6 @@ class Run:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._logger is not None:
-            self._logger.close()
+        with self._held:
+            if self._logger is not None:
+                self._logger.close()

@@ -33,7 +33,7 @@ class ClosedLoopStep:
         model: to align.
         loss: of a batch, with ``labels`` and ``learnt``; a loss module, or what the ranks wrapped it into.
         scenes: to learn from.
-        context: how they are cut up.
+        episode: options of their episodes.
         follow: ``candidates`` and ``recovery`` of :class:`~dpa.models.closest.ClosestActor`.
         options: the section ``alignment``.
         seed: of the order of scenes.

@@ -127,8 +127,7 @@ class Inputs:
         """
         looks: list[Look | ImitationLook] = []
         if watch is not None:
-            provenance = None if self.store is None else self.store.provenance
-            looks.append(Look(watch, self.episode, self.model, alignment, provenance))
+            looks.append(Look(watch, self.episode, self.model, alignment, self.config["tokenizer"]))
         if self.store is not None and SIDES[data.kind] == "targets" and self.store.provenance.num_rollouts > 1:
             looks.append(
                 ImitationLook(self.store, self.scenes, self.episode, self.model, alignment, data.rank_by, self.learnt)

@@ -19,7 +19,7 @@ from dpa.models.context import Context
 from dpa.preferences import nearest_farthest
 from dpa.rewards import REWARDS, RewardRollouts, advantages, check_horizon
 from dpa.rollout import RolloutCollector, RolloutJob, RolloutTask, Workers, plan_tasks
-from dpa.rollout.collector import agents_of, rows_within
+from dpa.rollout.collector import agents_of, check_staleness, rows_within
 from dpa.training.batches import Item, ShuffledOrder, collate_items, micro_batches, with_tokens
 from dpa.training.distributed import ALONE, Ranks
 from dpa.training.optim import accumulate_gradients, clip_and_step, make_optimizer, make_schedule
@@ -58,6 +58,21 @@ class Rolled(NamedTuple):
         return self.ranked[keys.TOKEN_VALID]
 
 
+def check_workers(options: DictConfig, model: MotionModel) -> tuple[Workers, int]:
+    """Who rolls out for a method that does so in every step, and agents times rollouts side by side.
+
+    Args:
+        options: the section ``alignment``: ``workers``, ``staleness`` and ``memory``.
+        model: to align.
+
+    Raises:
+        ValueError: options that cannot be.
+    """
+    workers = build(Workers, options.workers, "alignment.workers")
+    check_staleness(options.staleness, workers)
+    return workers, rows_within(options.memory, model)
+
+
 class OnPolicyStep:
     """Rolls the policy out in some scenes, ranks the rollouts, and learns from them.
 
@@ -72,7 +87,7 @@ class OnPolicyStep:
         model: to align.
         loss: of a batch; a loss module, or what the ranks wrapped it into.
         scenes: to learn from.
-        context: how they are cut up.
+        episode: options of their episodes.
         data: options of the method, of a kind in :data:`~recipes.alignment.data.ROLLED`.
         options: the section ``alignment``.
         seed: of the order of scenes and of what is drawn.
@@ -107,8 +122,8 @@ class OnPolicyStep:
         self.optimizer = make_optimizer(model, options.lr, options.weight_decay)
         self.schedule = make_schedule(self.optimizer, self.passes * options.steps, self.passes * options.warmup)
         self.order = ShuffledOrder(len(scenes), options.scenes_per_step, seed)
-        self.workers = build(Workers, options.workers, "alignment.workers")
-        self.most, self.sizes = rows_within(options.memory, model), partial(agents_of, scenes, options=episode)
+        self.workers, self.most = check_workers(options, model)
+        self.sizes = partial(agents_of, scenes, options=episode)
         decoding, distance = check_rolling(data)
         self.ranked_by = "missed" if data.ranking.get("kind") == "realism" else "distance"
         check_horizon(self.rewards, episode.steps)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from numpy import isnan, nanmean
 from omegaconf import DictConfig
 
 from dpa.losses.network import without_dropout
 from dpa.models import Contexts, MotionModel
-from dpa.preferences import PreferenceStore, Provenance
+from dpa.preferences import PreferenceStore
 from envs.episode import EpisodeOptions
 from envs.store import SceneStore
 from recipes.alignment.likelihoods import make_probes, probe, probe_sides
@@ -43,7 +43,7 @@ class Look:
         episode: options of their episodes.
         model: in training.
         options: the section ``alignment``.
-        learnt_from: origin of the rollouts that the training learns from, if it learns from such.
+        tokenizer: options that decide what a token of the model means.
 
     Raises:
         ValueError: rollouts of other scenes than the tuning ones, in other tokens, or one of each alone.
@@ -55,15 +55,14 @@ class Look:
         episode: EpisodeOptions,
         model: MotionModel,
         options: DictConfig,
-        learnt_from: Provenance | None,
+        tokenizer: dict[str, Any],
     ) -> None:
         store = open_ranked_scenes(watch.preferences, watch.scenes)
-        for name in ("tokenizer", "horizon"):
-            mine, other = getattr(learnt_from, name, None), getattr(store.provenance, name)
-            if learnt_from is not None and mine != other:
+        for name, mine in (("tokenizer", tokenizer), ("horizon", episode.horizon)):
+            if (other := getattr(store.provenance, name)) != mine:
                 raise ValueError(
-                    f"{store.folder} has {name} {other}, and the rollouts to learn from {mine}; let a policy of the "
-                    "same tokens roll the watched scenes out."
+                    f"{store.folder} has {name} {other}, and the policy in training {mine}; let a policy of the same "
+                    "tokens roll the watched scenes out."
                 )
         if store.provenance.num_rollouts < 2:
             raise ValueError(

@@ -66,7 +66,7 @@ LIMITS: dict[str, Limit] = {
     **dict.fromkeys(("show", "years"), Limit(list)),
     **dict.fromkeys(("rankings", "rewards", "context", "tokenizer", "setup", "labels", "published"), Limit(dict)),
     "grid": Limit(float, many=True),
-    **dict.fromkeys(("start", "trained", "decoding.chosen"), Limit(str, empty=True)),
+    **dict.fromkeys(("start", "trained", "decoding.chosen", "expert", "watch"), Limit(str, empty=True)),
     "optimizer": Limit(str, among=OPTIMIZERS),
     "schedule": Limit(str, among=SCHEDULES),
     "precision": Limit(str, among=PRECISIONS),

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
@@ -38,11 +40,20 @@ def build_distance(section: DictConfig, name: str) -> Distance:
         >>> build_distance(OmegaConf.create({"kind": "displacement", "measure": "final"}), "collection.ranking")
         DisplacementDistance(measure='final', aggregate='mean', agents='controlled')
     """
-    kind = section.get("kind", "preference")
+    kind = _section(section, name).get("kind", "preference")
     if kind not in DISTANCES:
         raise ValueError(f"{name}.kind must be one of {sorted(DISTANCES)}, got {kind!r}.")
     options = {key: value for key, value in section.items() if key != "kind"}
     return build(DISTANCES[kind], OmegaConf.create(options), name)
+
+
+def _section(given: Any, name: str) -> DictConfig:
+    if not OmegaConf.is_dict(given):
+        raise ValueError(
+            f"{name} must be a section of options, got {given!r}; a file of recipes/config/ranking is taken by "
+            f"ranking@{name}={given}, and options are given one by one, as {name}.kind={given}."
+        )
+    return given
 
 
 def ranking_options(section: DictConfig, differing: DictConfig) -> DictConfig:
@@ -55,7 +66,7 @@ def ranking_options(section: DictConfig, differing: DictConfig) -> DictConfig:
         >>> ranking_options(section, OmegaConf.create({"kind": "displacement", "measure": "final"}))
         {'kind': 'displacement', 'measure': 'final'}
     """
-    if differing.get("kind", section.kind) != section.kind:
+    if _section(differing, "an entry of rankings").get("kind", section.kind) != section.kind:
         return differing
     return OmegaConf.merge(section, differing)
 
@@ -111,13 +122,21 @@ class TimedDistance:
     def __init__(self, distance: Distance) -> None:
         self.distance, self.seconds = distance, 0.0
 
+    @property
+    def on_device(self) -> bool:
+        """Whether the distance ranks where trajectories were rolled out."""
+        return getattr(self.distance, "on_device", False)
+
     def describe(self) -> dict[str, Any]:
         """That of the distance."""
         return self.distance.describe()
 
     def __call__(self, scene: Scene, trajectories: Tensor, controlled: Tensor) -> Ranking:
         """Rank, and look at the clock."""
+        wait = partial(torch.cuda.synchronize, trajectories.device) if trajectories.is_cuda else lambda: None
+        wait()
         start = time.perf_counter()
         ranking = self.distance(scene, trajectories, controlled)
+        wait()
         self.seconds += time.perf_counter() - start
         return ranking

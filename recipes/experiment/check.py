@@ -19,8 +19,9 @@ from dpa.report.experiment import REPORTED, read_experiment
 from dpa.report.table import REFERENCE
 from envs.episode import EpisodeOptions
 from envs.options import differences
-from recipes.alignment.data import check_data
+from recipes.alignment.data import ROLLED, check_data
 from recipes.alignment.losses import check_fit, make_loss
+from recipes.alignment.on_policy import check_workers
 from recipes.collect import check_collection
 from recipes.common.cli import check_steps, plain, told_of
 from recipes.common.limits import GROUPS, check_limits, is_number
@@ -184,6 +185,12 @@ def _check_rankings(cfg: DictConfig) -> None:
 
 
 def _check_methods(cfg: DictConfig, policy: dict[str, Any]) -> None:
+    for name, method in cfg.methods.items():
+        if not OmegaConf.is_dict(method):
+            raise ValueError(
+                f"methods.{name} must be a section with data and loss, got {method!r}; to leave a method out name the "
+                "others in only=[...]."
+            )
     for name, part in product(cfg.methods, ("data", "loss")):
         if not OmegaConf.is_dict(cfg.methods[name].get(part)):
             raise ValueError(
@@ -213,6 +220,8 @@ def _check_methods(cfg: DictConfig, policy: dict[str, Any]) -> None:
             make_loss(cfg.methods[name].loss, model)
             if data.kind == "closed_loop":
                 check_following(model, data.candidates, data.recovery)
+            if data.kind in ROLLED:
+                check_workers(alignment, model)
             check_steps(alignment, "alignment")
 
 

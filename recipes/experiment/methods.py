@@ -35,12 +35,21 @@ class Setup:
     alignment: Mapping[str, Any] = field(default_factory=dict)
     length: float = 1.0
 
+    def scaled(self, steps: int) -> int:
+        """So many steps by the method's length, one at least.
+
+        Examples:
+            >>> Setup(length=0.5).scaled(150), Setup(length=0.5).scaled(1)
+            (75, 1)
+        """
+        return max(1, round(self.length * steps))
+
     def merged(self, section: DictConfig) -> DictConfig:
         """The section ``alignment`` of this method."""
         options = OmegaConf.merge(section, self.alignment)
         times = {
-            "steps": round(self.length * options.steps),
-            "snapshots": [round(self.length * step) for step in options.snapshots],
+            "steps": self.scaled(options.steps),
+            "snapshots": [self.scaled(step) for step in options.snapshots],
         }
         return OmegaConf.merge(options, times)
 
@@ -57,7 +66,7 @@ def kept(cfg: DictConfig) -> DictConfig:
     What is said of the others goes as well. Where the headline does, the first that is named is it.
 
     Raises:
-        ValueError: ``only`` is no list of methods of the experiment.
+        ValueError: ``only`` is no list of methods of the experiment, or methods need each other.
 
     Examples:
         >>> told = {"setup": {}, "labels": {"omf": "OMF"}}
@@ -72,6 +81,7 @@ def kept(cfg: DictConfig) -> DictConfig:
             f"only must be methods of the experiment as in only=[{next(iter(cfg.methods))}], got {cfg.only!r}; there "
             f"are {', '.join(cfg.methods)}."
         )
+    levels({name: setup_of(cfg, name) for name in cfg.methods})
     named, cfg = list(cfg.only), copy.deepcopy(cfg)
     others = set(cfg.methods) - {each for name in named for each in behind(cfg, name)}
     told = (OmegaConf.select(cfg, f"experiment.{name}") for name in ("setup", "labels", "published", "axis.values"))

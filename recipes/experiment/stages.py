@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import fcntl
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -92,21 +90,3 @@ def origins_beside(path: Path) -> Path:
 def read_account(path: Path) -> dict[str, dict[str, float]]:
     """``{stage: {job: seconds}}``, empty where nothing has run yet."""
     return read_json(path) if path.is_file() else {}
-
-
-@contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
-    """Keep other commands out of a folder as long as the block runs.
-
-    Raises:
-        ValueError: another one is at work there.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ValueError(
-                f"another command is at work in {folder}; wait for it, or name another output folder."
-            ) from None
-        yield

@@ -42,6 +42,16 @@ class Chosen(NamedTuple):
     tuned: frozenset[Run]
 
 
+def decoding_at(given: Sequence[float]) -> Decoding:
+    """A decoding as options have it, ``[top-p, temperature]``; written as 1 or 1.0 it is the same one.
+
+    Examples:
+        >>> decoding_at([1, 1.0])
+        Decoding(top_p=1.0, temperature=1.0, top_k=0)
+    """
+    return Decoding(*map(float, given))
+
+
 def chosen_in(found: Experiment) -> Chosen:
     """What a finished experiment has chosen; here nothing is rolled out for it."""
     at_common = [row for row in found.at_common.rows if decoding_of(row) == found.common]
@@ -168,7 +178,7 @@ def summarise_experiment(cfg: DictConfig, scenes: Mapping[str, Any], chosen: Cho
         stages: that were run, with their account.
     """
     experiment, methods = plain(cfg.experiment), list(chosen.best)
-    common, grid = Decoding(*cfg.decoding.common), [Decoding(*each) for each in cfg.decoding.grid]
+    common, grid = decoding_at(cfg.decoding.common), [decoding_at(each) for each in cfg.decoding.grid]
     at_common, at_best = list(chosen.common.items()), list(chosen.best.items())
     others = [(REFERENCE, Run(REFERENCE, each)) for each in grid if each != common]
     results = Results(cfg, [*at_common, *others, *at_best])
@@ -253,10 +263,10 @@ def compute(cfg: DictConfig, method: str, account: Mapping[str, Mapping[str, flo
             earlier.add(("align", f"align {{seed}} {run}"))
 
     def mean(stage: str, job: str) -> float:
-        names = [job.format(seed=seed) for seed in cfg.seeds]
-        if stage == "rank" and names[0] not in account.get(stage, {}):  # other processes ranked while they collected
-            return 0.0
-        return fmean(account[stage][name] for name in names)
+        done, names = account.get(stage, {}), [job.format(seed=seed) for seed in cfg.seeds]
+        if stage == "rank":  # where other processes rank while they collect, it is in the time of the collection
+            return fmean(done.get(name, 0.0) for name in names)
+        return fmean(done[name] for name in names)
 
     before = sum(mean(*each) for each in sorted(earlier))
     training = mean("align", f"align {{seed}} {method}")
@@ -267,9 +277,9 @@ def _read_in_step(cfg: DictConfig, method: str) -> int:
     """Rollouts that a step of a method reads."""
     options, data = setup_of(cfg, method).merged(cfg.alignment), cfg.methods[method].data
     held = num_candidates(data, cfg.collection.num_rollouts)
-    if data.kind in ROLLED:  # a step reads all that it has rolled out, or all of its pairs
-        return options.scenes_per_step * sum(held)
-    return options.scenes_per_step * sum(num_drawn(*held, options.pairs_per_scene))
+    # A step reads all that it has rolled out, or all of its pairs; the preferred side of AFD is logs.
+    drawn = held if data.kind in ROLLED else num_drawn(*held, options.pairs_per_scene)
+    return options.scenes_per_step * sum(drawn[1:] if data.kind == "adversarial" else drawn)
 
 
 def steps_of(cfg: DictConfig, policy: str) -> int:

@@ -62,6 +62,22 @@ def test_likelihoods_are_compared_too_and_a_scene_that_one_run_has_no_value_of_c
     assert measures["red_light"].interval.num_scenes == measures["realism"].interval.num_scenes - 1
 
 
+def test_seeds_that_both_have_are_paired_whichever_side_is_named_first(tmp_path: Path) -> None:
+    mine = write_runs(tmp_path)
+    path = mine / "experiments" / "methods.json"
+    content = json.loads(path.read_text())
+
+    def fewer(rows: list[dict]) -> list[dict]:
+        return [row for row in rows if not (row["method"] == "dpa_adef" and row["seed"] == SEEDS[-1])]
+
+    content["rows"], content["own_best"]["rows"] = fewer(content["rows"]), fewer(content["own_best"]["rows"])
+    path.write_text(json.dumps(content))
+    one = found(mine, "dpa_omf", "dpa_adef")["realism"]
+    other = found(mine, "dpa_adef", "dpa_omf")["realism"]
+    assert one.interval.num_seeds == other.interval.num_seeds == len(SEEDS) - 1
+    assert one.interval.mean == pytest.approx(-other.interval.mean)
+
+
 def test_a_method_of_another_experiment_is_named_with_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:

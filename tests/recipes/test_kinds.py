@@ -7,11 +7,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import pytest
 
 from dpa.models.scene import ContextOptions
+from dpa.realism.config import FOLDER
 from dpa.rewards.ranking import RealismRanking
 from recipes.common.kinds import check_kinds
 
@@ -86,6 +88,16 @@ def test_what_a_reader_takes_is_let_through(target: Callable, options: dict[str,
 def test_what_it_does_not_take_is_told_by_name(target: Callable, options: dict[str, Any], told: str) -> None:
     with pytest.raises(ValueError, match=told):
         check_kinds(target, options, "it")
+
+
+def test_a_metric_in_a_file_is_known_by_what_it_says(tmp_path: Path) -> None:
+    text, described = (FOLDER / "2024.yaml").read_text(), []
+    for name, content in (("one", text), ("other", text.replace("pseudocount: 0.1", "pseudocount: 0.2", 1))):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "mine.yaml").write_text(content)
+        described.append(RealismRanking(str(tmp_path / name / "mine.yaml")).describe())
+    assert described[0]["digest"] != described[1]["digest"]
+    assert "digest" not in RealismRanking("2024").describe(), "stores of a year stay what they are"
 
 
 def test_a_year_is_a_metric_as_a_number_too() -> None:

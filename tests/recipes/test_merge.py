@@ -140,6 +140,38 @@ def test_options_of_a_pre_training_that_was_not_done_may_differ(parts: list[Path
     assert merge(tmp_path / "all", [parts[0], later, parts[2]]).is_file()
 
 
+def test_machines_may_have_worked_and_logged_otherwise(parts: list[Path], tmp_path: Path) -> None:
+    def elsewhere(found: dict[str, Any]) -> None:
+        found["config"]["collection"]["workers"] |= {"count": 8, "backend": "process"}
+        found["config"]["logger"] |= {"backend": "wandb", "mode": "online"}
+
+    def ranked_while_collecting(account: dict[str, dict[str, float]]) -> None:
+        account["rank"] = {job: value for job, value in account["rank"].items() if not job.startswith("collect")}
+
+    shutil.copytree(parts[0], tmp_path / "first")
+    first = edit(tmp_path / "first", "experiments/families.json", elsewhere)
+    edit(first, "stages.json", ranked_while_collecting)
+    edit(first, "origins.json", lambda origins: ranked_while_collecting(origins["jobs"]))
+    merge(tmp_path / "all", [first, *parts[1:]])
+    found = content(tmp_path / "all")
+    assert found["config"]["logger"] == {"backend": "csv", "mode": "offline"}
+    assert found["compute"]["dpa_omf"]["before"] > 0
+
+
+def test_methods_on_an_axis_stay_on_it(parts: list[Path], tmp_path: Path) -> None:
+    def placed(**values: float) -> Callable[[dict[str, Any]], None]:
+        axis = {"name": "x", "values": values, "log": False}
+        return lambda found: found["config"]["experiment"].update(axis=axis)
+
+    each = []
+    for part, values in ((parts[0], {"dpa_omf": 1.0, "omf_normalised": 2.0}), (parts[1], {"rloo_realism": 3.0})):
+        shutil.copytree(part, tmp_path / part.name)
+        each.append(edit(tmp_path / part.name, "experiments/families.json", placed(**values)))
+    merge(tmp_path / "all", each)
+    told = content(tmp_path / "all")["axis"]["values"]
+    assert told == {"dpa_omf": 1.0, "omf_normalised": 2.0, "rloo_realism": 3.0}
+
+
 def test_the_first_part_that_has_a_method_decides_how_it_is_decoded(
     parts: list[Path], whole: Path, tmp_path: Path
 ) -> None:

@@ -13,7 +13,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from dpa.models import Decoding
-from envs.files import write_json
+from envs.files import alone_in, write_json
 from recipes.common.cli import CONFIG
 from recipes.compare import choose, train_policies
 from recipes.experiment import jobs
@@ -22,7 +22,7 @@ from recipes.experiment.jobs import runs_of
 from recipes.experiment.methods import drawing_seed, kept, read_setups, setup_of, snapshots_of
 from recipes.experiment.pool import Workers
 from recipes.experiment.runs import Run
-from recipes.experiment.stages import Stages, alone_in, read_account
+from recipes.experiment.stages import Stages, read_account
 from recipes.experiment.summary import Results, budget, compute
 
 EXPERIMENTS = sorted(path.stem for path in (Path(CONFIG["config_path"]) / "experiment").glob("*.yaml"))
@@ -281,6 +281,11 @@ def test_a_method_comes_after_those_that_it_starts_from_or_learns_from() -> None
             "adversarial_afd.ranking=other says nothing to .*kind=adversarial, which reads no ranks",
         ),
         (("methods.dpa_omf.data.kind=pair",), r"methods\.dpa_omf: method\.data\.kind must be one of"),
+        (("methods.dpa_adef=null",), r"methods\.dpa_adef must be a section .* got None; to leave a method out"),
+        (("experiment=competent", "alignment.staleness=1"), "methods.omf_on_policy: staleness=1 needs workers that"),
+        (("experiment=competent", "only=[rloo]", "alignment.workers.count=2"), "2 workers need backend=process"),
+        (("collection.ranking=displacement",), r"is taken by ranking@collection\.ranking=displacement"),
+        (("+rankings.mine=displacement",), "an entry of rankings must be a section of options, got 'displacement'"),
     ],
 )
 def test_an_experiment_that_cannot_work_is_refused_before_any_work(options: tuple[str, ...], message: str) -> None:
@@ -318,6 +323,12 @@ def test_one_command_at_a_time_works_in_a_folder(tmp_path: Path) -> None:
         pass
     with alone_in(study):
         pass
+
+
+def test_methods_that_need_each_other_are_told_with_only_too() -> None:
+    circle = ("+experiment.setup.dpa_omf={start:dpa_adef}", "+experiment.setup.dpa_adef={start:dpa_omf}")
+    with pytest.raises(ValueError, match="dpa_omf, dpa_adef need each other"):
+        kept(configuration("only=[dpa_omf]", *circle))
 
 
 def test_snapshots_end_before_the_last_step_of_their_method() -> None:
@@ -392,6 +403,9 @@ def test_compute_counts_what_came_before_a_method_and_its_own_training() -> None
         "its own ranking in place of the other"
     )
     assert compute(other, "cat_k", account) == {"before": 0, "training": 5, "steps": 150}, "it rolls out by itself"
+    for seed, told in (("1", 20 + 0.5), ("0", 20.0)):  # other processes ranked while they collected for this seed
+        del account["rank"][f"collect {seed} train reference"]
+        assert compute(rounds, "dpa_omf", account)["before"] == told
 
 
 def test_a_budget_counts_what_a_method_starts_from_and_whom_it_learns_from() -> None:
@@ -409,6 +423,8 @@ def test_a_budget_counts_what_a_method_starts_from_and_whom_it_learns_from() -> 
     thinned = configuration("experiment=scaling", "alignment.pairs_per_scene=4")
     assert budget(thinned, "omf_r2")["rollouts"] == 150 * 6 * 2 * 2, "of the two pairs that a scene keeps"
     assert budget(thinned, "omf_r0_25")["rollouts"] == 150 * 6 * 2, "a scene that keeps one has one pair"
+    afd = budget(configuration(), "adversarial_afd")
+    assert afd == own | {"rollouts": 150 * 6}, "one side of it is logs"
     assert expert == own | {"steps": 300, "rollouts": 150 * 6 * 2 + 150 * 6}, (
         "SFT reads one rollout where AfD reads two"
     )

@@ -598,9 +598,12 @@ def test_watched_rollouts_in_other_tokens_are_refused(
     origin.write_text(json.dumps(content))
     for piece in tuned.glob("*.groups"):  # of the store as it was
         piece.unlink()
-    outcome = run("align", *watched(runs, options, tmp_path / "run", f"watch={tuned}"))
-    assert outcome.status == 2
-    assert f"{tuned} has tokenizer" in outcome.err and "let a policy of the same tokens roll" in outcome.err
+    policy, output = f"policy={runs / 'reference/policy.pt'}", f"output={tmp_path / 'rloo'}"
+    rolled = options("align", "method=rloo", policy, output, f"watch={tuned}")
+    for command in (watched(runs, options, tmp_path / "run", f"watch={tuned}"), rolled):
+        outcome = run("align", *command)
+        assert outcome.status == 2
+        assert f"{tuned} has tokenizer" in outcome.err and "let a policy of the same tokens roll" in outcome.err
 
 
 def watched(runs: Path, options: Callable, folder: Path, *more: str) -> list[str]:
@@ -706,10 +709,10 @@ def test_drift_is_measured_from_the_reference_also_in_a_second_round(
     assert run("align", *watched(runs, options, tmp_path / "first")).status == 0
     cfg = compose_recipe("align", options, runs)
     watch = Watch(open_splits(cfg.scenes).tune, tmp_path / "tuned", runs / "reference/policy.pt")
-    learnt_from, drift = PreferenceStore(runs / "preferences").provenance, {}
+    drift = {}
     for name in ("reference", "first"):
-        model, episode, _ = open_policy((tmp_path if name == "first" else runs) / name / "policy.pt")
-        drift[name] = Look(watch, episode, model, cfg.alignment, learnt_from)("cpu")["tune/kl"]
+        model, episode, config = open_policy((tmp_path if name == "first" else runs) / name / "policy.pt")
+        drift[name] = Look(watch, episode, model, cfg.alignment, config["tokenizer"])("cpu")["tune/kl"]
     assert drift["reference"] == pytest.approx(0, abs=1e-7) and drift["first"] > 1e-5
 
 

@@ -327,5 +327,8 @@ def _budget(experiment: Experiment) -> Html:
     ]
     if not rows:
         return Html("")
-    about = hint("Of one training run; a further round counts those of the method that it starts from.")
-    return joined([table(["method", "optimiser steps", "rollouts read", "starts from"], rows), about])
+    about = hint(
+        "Of one training run; a further round counts those of the method that it starts from. GRPO learns from the "
+        "rollouts of a step more than once."
+    )
+    return joined([table(["method", "steps", "rollouts read", "starts from"], rows), about])

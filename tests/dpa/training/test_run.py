@@ -52,6 +52,16 @@ def weights(run: Run) -> torch.Tensor:
     return torch.cat([p.detach().flatten() for p in run.parts["net"].parameters()])
 
 
+def test_two_runs_in_one_folder_are_refused_before_the_second_writes(tmp_path: Path) -> None:
+    def run() -> Run:
+        return Run(tmp_path, {"net": nn.Linear(1, 1)}, config={}, total_steps=3, checkpoint_interval=1)
+
+    with run(), pytest.raises(ValueError, match=f"another command is at work in {tmp_path}"):
+        run()
+    with run() as again:
+        assert list(again.steps()) == [0, 1, 2]
+
+
 @pytest.mark.parametrize("stop_at", [4, 5, 9])
 def test_an_interrupted_run_ends_like_an_uninterrupted_one(tmp_path: Path, stop_at: int) -> None:
     whole = train(tmp_path / "whole")
