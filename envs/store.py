@@ -18,6 +18,7 @@ import numpy as np
 
 from envs.card import Card
 from envs.files import write_json
+from envs.positions import positions
 from envs.scene import Lacks, Scene, SceneError
 from envs.shards import FORMAT_VERSION, SUFFIX, Shard, file_digest, read_versioned
 from envs.sources.fields import shown
@@ -206,13 +207,16 @@ class SceneStore:
     def subset(self, indices: Sequence[int]) -> SceneStore:
         """A view of some scenes, in the order given, that shares this store's files.
 
+        Args:
+            indices: of scenes, or a mask over all of them.
+
         Raises:
-            IndexError: an index out of range.
+            IndexError: an index out of range, or a mask of another length.
         """
         view = object.__new__(SceneStore)
         view.folders, view.manifests = self.folders, self.manifests
         view._shards, view._starts, view._owner = self._shards, self._starts, self._owner
-        view._rows = self._rows[np.asarray(indices, dtype=np.int64)]
+        view._rows = self._rows[positions(indices, len(self))]
         return view
 
     def select(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from numbers import Integral
 from os import PathLike
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -94,11 +94,25 @@ class TrafficEnv(EnvBase):
         self.scenes, self.episode = scenes, episode or EpisodeOptions()
         self.num_scenes, self.num_rollouts, self.order = num_scenes, num_rollouts, order
         self.num_agents = largest_scene(scenes, **self.episode.cast) if num_agents is None else num_agents
-        self._signals = Signals(signals, num_rollouts, self.device) if signals else None
+        self._named = tuple(signals)
         self._cursor = 0
         self._generator = torch.Generator()
-        self._scene = torch.full((num_scenes,), -1)  # stays on the host, which loads the scenes
+        self._begin()
         self._make_specs()
+
+    def _begin(self) -> None:
+        """As before the first reset, on the device at hand."""
+        self._signals = Signals(self._named, self.num_rollouts, self.device) if self._named else None
+        self._scene = torch.full((self.num_scenes,), -1)  # stays on the host, which loads the scenes
+        self._loaded = False
+
+    def to(self, *args: Any, **kwargs: Any) -> TrafficEnv:
+        """Move the environment; an episode under way is over, and the next reset begins another."""
+        there = self.device
+        moved = super().to(*args, **kwargs)
+        if self.device != there:
+            self._begin()
+        return moved
 
     def _make_specs(self) -> None:
         batch, agents, steps = self.batch_size, (*self.batch_size, self.num_agents), self.episode.decision_steps
@@ -166,7 +180,7 @@ class TrafficEnv(EnvBase):
         each = self._repeat
         agents = batch.agents
         end = CURRENT_STEP + self.episode.steps + 1
-        fresh = not hasattr(self, "_start")
+        fresh, self._loaded = not self._loaded, True
         self._start = each(agents.recent(self.episode.decision_steps))
         self._log = each(agents.poses[..., CURRENT_STEP + 1 : end, :].unflatten(-2, (-1, self.episode.decision_steps)))
         self._log_valid = each(

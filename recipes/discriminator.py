@@ -99,7 +99,7 @@ def trained(cfg: DictConfig, scenes: SceneStore, policy: Path, name: str) -> tup
 def seen(each: Rolled, sight: Sight, tokenizer: MotionTokenizer, options: EpisodeOptions) -> tuple[Any, Tensor]:
     """The motions of a scene's log and rollouts, and the log ``[A, 80, 4]`` that they were compared with."""
     log = driven_log(each.scene, tokenizer if sight.tokenized else None, options)
-    return sight(each, log), log
+    return sight(each, log, options.decision_steps if sight.tokenized else 1), log
 
 
 @torch.no_grad()

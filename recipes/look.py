@@ -41,16 +41,16 @@ class RankedScene(NamedTuple):
         scene: uncollated.
         trajectories: ``[K, A, T * F, 4]`` x, y, z, heading.
         ranked: what the store holds of the scene, agents padded to those of the simulation.
-        distance: that ranked them.
+        distance: that ranked them, where couplings are looked at.
     """
 
     scene: Scene
     trajectories: Tensor
     ranked: TensorDict
-    distance: PreferenceDistance
+    distance: PreferenceDistance | None
 
 
-def open_ranked(policy: Path, preferences: Path, scenes: SceneStore, name: str) -> RankedScene:
+def open_ranked(policy: Path, preferences: Path, scenes: SceneStore, name: str, *, coupled: bool = True) -> RankedScene:
     """One scene of a preference store; its poses follow from its tokens.
 
     Args:
@@ -58,6 +58,7 @@ def open_ranked(policy: Path, preferences: Path, scenes: SceneStore, name: str) 
         preferences: folder of the store.
         scenes: that the preferences are of.
         name: id or index of the scene.
+        coupled: couplings are to be looked at, which not every distance has.
 
     Raises:
         SceneError: no such scene.
@@ -74,7 +75,7 @@ def open_ranked(policy: Path, preferences: Path, scenes: SceneStore, name: str) 
         )
     (rolled,) = stored(store, rows, scenes, model, options)
     ranked = store.read(rows, num_agents=len(rolled.controlled))[0]
-    return RankedScene(rolled.scene, rolled.trajectories, ranked, distance_of(store))
+    return RankedScene(rolled.scene, rolled.trajectories, ranked, distance_of(store) if coupled else None)
 
 
 def distance_of(store: PreferenceStore) -> PreferenceDistance:
@@ -84,8 +85,10 @@ def distance_of(store: PreferenceStore) -> PreferenceDistance:
         ValueError: it has features or options that this program does not have.
     """
     options: dict[str, Any] = dict(store.provenance.ranking)
-    if options.pop("kind", "preference") != "preference":
-        raise ValueError(f"{store.folder} was ranked by displacement, which couples nothing; look at another store.")
+    if (kind := options.pop("kind", "preference")) != "preference":
+        raise ValueError(
+            f"{store.folder} was ranked by {kind}, which couples nothing; say figure=rollouts, or open another store."
+        )
     unknown = sorted(set(options["weights"]) - set(FEATURES))
     if unknown:
         raise ValueError(
@@ -178,10 +181,11 @@ def main(cfg: DictConfig) -> None:
         raise ValueError(f"figure must be one of {', '.join(FIGURES)}, got {cfg.figure!r}.")
     policy = given_policy(cfg.policy)
     scenes = open_splits(cfg.scenes)[cfg.split]
-    group = open_ranked(policy, Path(cfg.preferences), scenes, str(cfg.scene))
+    coupled = cfg.figure == "coupling"
+    group = open_ranked(policy, Path(cfg.preferences), scenes, str(cfg.scene), coupled=coupled)
     output = Path(cfg.output)
     output.parent.mkdir(parents=True, exist_ok=True)
-    if cfg.figure == "coupling":
+    if coupled:
         rollout = chosen_rollout(group.ranked[keys.RANK], str(cfg.rollout))
         look_at_coupling(group, rollout, chosen_agent(group, rollout, str(cfg.agent)), output)
     else:

@@ -140,7 +140,7 @@ def read_rates(path: Path) -> tuple[dict[str, float], dict[str, float], dict[str
         rows = rows[::-1]  # the first ones count
         rates = {row["how"]: float(row["agent_steps_per_second"]) for row in rows}
         memory = {row["how"]: float(row["gib"]) for row in rows}
-        missing = {"ranked", "collector", "trained"} - rates.keys()
+        missing, measured = {"ranked", "collector", "trained"} - rates.keys(), content["options"]
     except FileNotFoundError as error:
         raise ValueError(
             f"{path} does not exist; `python -m recipes.benchmark rollout --json rollout.json` writes one."
@@ -149,7 +149,7 @@ def read_rates(path: Path) -> tuple[dict[str, float], dict[str, float], dict[str
         raise ValueError(f"{path} is no JSON of `python -m recipes.benchmark rollout` ({error!r}).") from error
     if missing:
         raise ValueError(f"{path} lacks {sorted(missing)}; measure again with `python -m recipes.benchmark rollout`.")
-    return rates, memory, content["options"]
+    return rates, memory, measured
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -157,6 +157,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = make_parser().parse_args(arguments)
     try:
         check_positive(options)
+        if options.json is not None and options.json.is_dir():
+            raise ValueError(f"--json {options.json} is a folder; name a file.")
         rates, memory, measured = read_rates(options.rollout)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

@@ -146,6 +146,7 @@ def main(cfg: DictConfig) -> None:
         known = ", ".join((".html", *DRAWN))
         raise ValueError(f"output={cfg.output} is no page, picture or film; name a file that ends in one of {known}.")
     check_writable(cfg.output)
+    Path(cfg.output).parent.mkdir(parents=True, exist_ok=True)
     policies = given_policies(cfg)
     scenes = open_splits(cfg.scenes)[cfg.split]
     players = roll_out(

@@ -25,7 +25,9 @@ from recipes.common.rolled import stored
 from recipes.common.scenes import open_splits
 
 
-def rerank(ranking: DictConfig, scenes: SceneStore, policy: Path, preferences: Path, folder: Path) -> PreferenceStore:
+def rerank(
+    ranking: DictConfig, scenes: SceneStore, policy: Path, preferences: Path, folder: Path, device: str = "cpu"
+) -> PreferenceStore:
     """Fill a preference store with the rollouts of another one, ranked anew; goes on after a kill.
 
     Args:
@@ -34,17 +36,19 @@ def rerank(ranking: DictConfig, scenes: SceneStore, policy: Path, preferences: P
         policy: file of the policy that made them.
         preferences: folder of the store that holds them.
         folder: of the store to fill.
+        device: where distances rank that can do so anywhere.
     """
     model, options, _ = open_policy(policy)
     store, distance = open_preferences(preferences, scenes, model, policy), build_distance(ranking, "ranking")
     provenance = replace(store.provenance, ranking=distance.describe())
+    there = device if getattr(distance, "on_device", False) else "cpu"
     with PreferenceWriter(folder, provenance) as writer:
         done = writer.scenes_done
         rows = [row for row, scene in enumerate(store.scenes.tolist()) if scene not in done]
         bar = progress(total=len(store), description="rank", initial=len(store) - len(rows), unit="scene")
         with bar:
             for row, each in zip(rows, stored(store, rows, scenes, model, options), strict=True):
-                ranked = distance(each.scene, each.trajectories, each.controlled)
+                ranked = distance(each.scene, each.trajectories.to(there), each.controlled)
                 group = store.read([row], num_agents=each.trajectories.shape[1])
                 writer.append(group.update(_fields(ranked)))
                 bar.update()
@@ -53,14 +57,15 @@ def rerank(ranking: DictConfig, scenes: SceneStore, policy: Path, preferences: P
 
 def _fields(ranked: Ranking) -> dict[str, Tensor]:
     """What a ranking decides, for a batch of one group."""
-    return {
-        keys.DISTANCE: ranked.distance[None],
-        keys.AGENT_DISTANCE: ranked.agent_distance[None],
-        keys.ADE: ranked.ade[None],
-        keys.AGENT_RANKED: ranked.agent_ranked[None],
-        keys.FEATURE_SHARE: ranked.feature_share[None],
-        keys.RANK: rank_of(ranked.distance[None]),
+    fields = {
+        keys.DISTANCE: ranked.distance,
+        keys.AGENT_DISTANCE: ranked.agent_distance,
+        keys.ADE: ranked.ade,
+        keys.AGENT_RANKED: ranked.agent_ranked,
+        keys.FEATURE_SHARE: ranked.feature_share,
+        keys.RANK: rank_of(ranked.distance),
     }
+    return {key: value[None].cpu() for key, value in fields.items()}
 
 
 @hydra.main(**CONFIG, config_name="rerank")
@@ -69,7 +74,7 @@ def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.rerank``."""
     policy = given_policy(cfg.policy)
     scenes = open_splits(cfg.scenes)[cfg.split]
-    store = rerank(cfg.ranking, scenes, policy, Path(cfg.preferences), Path(cfg.output))
+    store = rerank(cfg.ranking, scenes, policy, Path(cfg.preferences), Path(cfg.output), cfg.device)
     print(f"preferences of {len(store)} scenes: {cfg.output}")
 
 

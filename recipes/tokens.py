@@ -9,6 +9,7 @@ tokens leave of the metric to any policy that uses them.
 
 from __future__ import annotations
 
+from statistics import fmean
 from typing import Any
 
 import hydra
@@ -102,13 +103,19 @@ def realism_left(scenes: SceneSource, tokenizer: MotionTokenizer, metric: Realis
     return found
 
 
-def realism_table(found: dict[str, list[Any]]) -> dict[str, dict[str, float]]:
-    """Means over the scenes that have realism."""
+def realism_table(found: dict[str, list[Any]]) -> tuple[dict[str, dict[str, float]], int]:
+    """Means over the scenes that have realism, and how many these are.
+
+    Raises:
+        ValueError: none has.
+    """
     known = [place for place, result in enumerate(found["log"]) if result["realism"] == result["realism"]]
-    return {
-        name: {key: sum(results[place][key] for place in known) / max(1, len(known)) for key in BUCKETS}
-        for name, results in found.items()
+    if not known:
+        raise ValueError(f"none of the {len(found['log'])} scenes has realism by this metric; take others.")
+    means = {
+        name: {key: fmean(results[place][key] for place in known) for key in BUCKETS} for name, results in found.items()
     }
+    return means, len(known)
 
 
 @hydra.main(**CONFIG, config_name="tokens")
@@ -121,9 +128,9 @@ def main(cfg: DictConfig) -> None:
     for name, row in errors.items():
         table.add_row(name, *(f"{value:.3f}" if isinstance(value, float) else str(value) for value in row.values()))
     Console(markup=False).print(table)
-    left = realism_table(realism_left(scenes, model.tokenizer, RealismConfig.load(str(cfg.metric))))
+    left, num_scenes = realism_table(realism_left(scenes, model.tokenizer, RealismConfig.load(str(cfg.metric))))
     spoken = f"{model.tokenizer.vocab_size} tokens" if model.tokenizer.vocab_size else "patches"
-    realistic = Table("", *BUCKETS, title=f"realism, {len(scenes)} scenes, {spoken}")
+    realistic = Table("", *BUCKETS, title=f"realism, {num_scenes} scenes, {spoken}")
     for name, row in left.items():
         realistic.add_row("log through tokens" if name == "tokens" else name, *(f"{row[key]:.3f}" for key in BUCKETS))
     Console(markup=False).print(realistic)

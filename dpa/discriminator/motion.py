@@ -77,6 +77,7 @@ def observed_motion(
     ego: Tensor | None = None,
     stride: int = 5,
     road: Sequence[str] = ROAD,
+    decision_steps: int = 1,
 ) -> tuple[Tensor, Tensor]:
     """What is seen of every measured agent at every measured step.
 
@@ -89,6 +90,8 @@ def observed_motion(
         ego: ``[E]`` int64, rows of the agents to look at; all of them by default.
         stride: look at every ``stride``-th step, 1 to 10.
         road: names of :data:`~dpa.ranking.FEATURES`.
+        decision_steps: steps of a token, of trajectories that were decoded from tokens: the one with a hole in it
+            counts for nothing, see :func:`until_first_hole`.
 
     Returns:
         values ``[R, E, T // stride, D]`` (:data:`OWN`, class, neighbours, ``road``), 0 where not valid, and valid
@@ -109,7 +112,7 @@ def observed_motion(
     """
     if not 1 <= stride <= CURRENT_STEP:
         raise ValueError(f"stride must be 1 to {CURRENT_STEP} (the history of a scene), got {stride}.")
-    scene = until_first_hole(scene)
+    scene = until_first_hole(scene, decision_steps)
     ego = torch.arange(trajectories.shape[1]) if ego is None else ego
     phi, phi_valid = occupancy_features(scene, trajectories, road, ego=ego, stride=stride)
     poses, there = _tracks(scene, trajectories, stride)

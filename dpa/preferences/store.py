@@ -19,6 +19,7 @@ from torch import Tensor
 from dpa.preferences.chunk import MENDING, ChunkRecord, chunk_files, intact, read_group, read_record
 from dpa.preferences.group import Group, check_group, pad_groups
 from dpa.preferences.provenance import Provenance, StoreError
+from envs.positions import positions
 
 
 class PreferenceStore:
@@ -68,7 +69,7 @@ class PreferenceStore:
         """Some groups, agents padded to the largest of them (see :meth:`read`)."""
         if isinstance(index, slice):
             index = range(len(self))[index]
-        return self.read([index] if isinstance(index, int) else index)
+        return self.read(index)
 
     @property
     def distance(self) -> Tensor:
@@ -85,11 +86,11 @@ class PreferenceStore:
         """Of all files of the chunks."""
         return sum(path.stat().st_size for path in self._files)
 
-    def read(self, index: Iterable[int] | Tensor, num_agents: int | None = None) -> TensorDict:
+    def read(self, index: int | Iterable[int] | Tensor, num_agents: int | None = None) -> TensorDict:
         """Copy groups into memory; only their own blocks are read.
 
         Args:
-            index: ``[S]`` positions in the store.
+            index: ``[S]`` positions in the store, one alone, or a mask over all groups.
             num_agents: A to pad to; by default the largest group asked for. Rows at the end that neither act, nor are
                 ranked, nor are of a class were not kept, so A can be smaller than in the environment.
 
@@ -97,11 +98,11 @@ class PreferenceStore:
             batch size ``[S]``, keys ``SCENE`` and those of a ranked group of :mod:`envs.keys`.
 
         Raises:
-            IndexError: a position outside the store.
+            IndexError: a position outside the store, or a mask of another length.
             StoreError: a group is damaged.
             ValueError: ``num_agents`` is below the number of agents of a group.
         """
-        groups = [self.group(int(i)) for i in index]
+        groups = [self.group(place) for place in positions(index, len(self)).tolist()]
         largest = max((len(group.tokens) for group in groups), default=0)
         if num_agents is not None and largest > num_agents:
             raise ValueError(f"num_agents must be at least {largest}, the largest group asked for; got {num_agents}.")

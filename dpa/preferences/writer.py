@@ -73,7 +73,9 @@ class PreferenceWriter:
         with _locked(self.folder), _new_file(self.folder) as file:
             if not (self.folder / METADATA_FILE).exists():
                 _put(file, self.provenance.to_json().encode(), self.folder / METADATA_FILE)
-            Provenance.from_folder(self.folder).check_same(self.provenance, self.folder)
+            found = Provenance.from_folder(self.folder)
+            found.check_same(self.provenance, self.folder)
+            self.provenance = found  # 1 and 1.0 are the same to the check, and not to the digest in every chunk
             self._look()
 
     def _check_folder(self) -> None:

@@ -250,7 +250,7 @@ class PreferenceDistance:
             step=stride * STEP_SECONDS,
             **self.solver,
         )
-        return Coupled(phi[:-1], phi[-1], valid, weights, moved)
+        return Coupled(phi[:-1], phi[-1], valid, weights.to(phi), moved)
 
 
 def check_options(distance: object, **known: Collection[str]) -> None:

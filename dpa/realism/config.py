@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import cache
@@ -53,6 +54,14 @@ class Histogram:
     pooled: bool = False
     per_step: bool = False
 
+    def __post_init__(self) -> None:
+        _check_weight(self.weight)
+        if self.bins < 1:
+            raise ValueError(f"bins must be 1 or more, got {self.bins}.")
+        if not self.low < self.high:
+            raise ValueError(f"low must be less than high, got {self.low} and {self.high}.")
+        _check_pseudocount(self.pseudocount)
+
 
 @dataclass(frozen=True)
 class Kernel:
@@ -70,6 +79,11 @@ class Kernel:
     pooled: bool = False
     per_step: bool = False
 
+    def __post_init__(self) -> None:
+        _check_weight(self.weight)
+        if not 0 < self.bandwidth < math.inf:
+            raise ValueError(f"bandwidth must be above 0, got {self.bandwidth}.")
+
 
 @dataclass(frozen=True)
 class Indicator:
@@ -84,6 +98,20 @@ class Indicator:
     pseudocount: float
     weight: float
     pooled: bool = False
+
+    def __post_init__(self) -> None:
+        _check_weight(self.weight)
+        _check_pseudocount(self.pseudocount)
+
+
+def _check_weight(weight: float) -> None:
+    if not 0 <= weight < math.inf:
+        raise ValueError(f"weight must be 0 or more, got {weight}.")
+
+
+def _check_pseudocount(pseudocount: float) -> None:
+    if not 0 <= pseudocount < math.inf:
+        raise ValueError(f"pseudocount must be 0 or more, got {pseudocount}.")
 
 
 @dataclass(frozen=True)
@@ -143,6 +171,12 @@ class RealismConfig:
                 f"realism configuration {self.name!r} gives traffic_light_violation the weight {weight} but has "
                 "traffic_lights: false; set one of them."
             )
+        for bucket, names in BUCKETS.items():
+            if not sum(self.weights.get(name, 0.0) for name in names):
+                raise ValueError(
+                    f"realism configuration {self.name!r} weighs nothing of {bucket}, which is told beside the whole; "
+                    f"give one of {', '.join(names)} a weight above 0, as little as 1e-6 if it is not to count."
+                )
 
     @property
     def digest(self) -> str:
@@ -223,7 +257,11 @@ def _read_estimator(data: Any, path: Path, where: str) -> Histogram | Kernel | I
     optional = {name for name, field in fields.items() if field.default is not dataclasses.MISSING}
     _check_keys(data, set(fields), path, where, optional)
     kinds = {"int": int, "float": float, "bool": bool}
-    return cls(**{key: _read(kinds[fields[key].type], value, path, f"{where}.{key}") for key, value in data.items()})
+    read = {key: _read(kinds[fields[key].type], value, path, f"{where}.{key}") for key, value in data.items()}
+    try:
+        return cls(**read)
+    except ValueError as error:
+        raise ValueError(f"{path}: {where}: {error}") from None
 
 
 def _choice(value: Any, known: Sequence[str], path: Path, where: str) -> Any:

@@ -130,6 +130,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; returns the exit status."""
     options = _parser().parse_args(arguments)
     try:
+        if options.json is not None and options.json.is_dir():
+            raise ValueError(f"--json {options.json} is a folder; name a file.")
         results = score(
             options.scenario,
             options.rollouts,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import multiprocessing
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -123,7 +124,8 @@ class ProcessCrew:
 
     def __init__(self, job: RolloutJob, workers: Workers) -> None:
         self.size = workers.count
-        self._job, self._threads = job, workers.threads
+        # A model on a GPU would be shared with the workers, each of which moves its own to its GPU.
+        self._job, self._threads = replace(job, model=copy.deepcopy(job.model).cpu()), workers.threads
         self._latest: tuple[dict[str, Any] | None, int] = (None, job.seed)
         self._behind: set[int] = set()
         self._busy: set[int] = set()

@@ -28,7 +28,7 @@ def make_parser() -> argparse.ArgumentParser:
     """Options of the command line."""
     parser = argparse.ArgumentParser(prog="python -m dpa.safety", description=__doc__)
     parser.add_argument("store", help="folder of a scene store (python -m envs.convert makes one)")
-    parser.add_argument("--limit", type=int, help="measure the first scenes only")
+    parser.add_argument("--limit", type=int, metavar="N", help="measure the first N scenes only")
     return parser
 
 
@@ -43,12 +43,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of ``python -m dpa.safety``: all present agents of each log, means over scenes."""
     options = make_parser().parse_args(arguments)
     try:
-        scenes = SceneStore(options.store)
+        if options.limit is not None and options.limit < 1:
+            raise ValueError(f"--limit must be 1 or more, got {options.limit}.")
+        measure(SceneStore(options.store), options.limit)
     except (OSError, ValueError) as error:
         sys.exit(f"error: {error}")
+
+
+def measure(scenes: SceneStore, limit: int | None) -> None:
+    """Print the measures of the first scenes of a store, or of all."""
     values: dict[str, list[float]] = {name: [] for name in MEASURES}
     counts, off = torch.zeros(len(AgentKind), dtype=torch.int64), torch.zeros(len(AgentKind), dtype=torch.int64)
-    for index in progress(range(min(len(scenes), options.limit or len(scenes))), "measure", unit="scene"):
+    for index in progress(range(min(len(scenes), limit or len(scenes))), "measure", unit="scene"):
         scene = scenes[index]
         agents, present = scene.agents, scene.agents.present
         log = agents.trajectory[None, present, NOW + 1 :]

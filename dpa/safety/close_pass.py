@@ -85,7 +85,7 @@ def _visits(boxes: Tensor, there: Tensor, pairs: Tensor, lag: int) -> Tensor:
     """
     rollout, first, second = pairs
     row, later = rollout * boxes.shape[1] + first, rollout * boxes.shape[1] + second
-    early, late = slice(0, boxes.shape[2] - lag, STRIDE), slice(lag, None, STRIDE)
+    early, late = slice(0, max(0, boxes.shape[2] - lag), STRIDE), slice(lag, None, STRIDE)
     reach = boxes[0, :, 0, 3:].norm(dim=-1) / 2
     squared = 0
     for axis in (0, 1):

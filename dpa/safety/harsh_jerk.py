@@ -61,4 +61,6 @@ def jerks(poses: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
     x, y = change.unbind(-1)
     acceleration = torch.stack((x * cos + y * sin, y * cos - x * sin), -1)
     jerk = (acceleration[..., span:, :] - acceleration[..., :-span, :]) / DECISION_SECONDS
+    if valid.shape[-1] <= 3 * span:  # too short for a jerk
+        return jerk, valid[:, :0]
     return jerk, valid.unfold(-1, 3 * span + 1, 1).all(-1)

@@ -170,7 +170,7 @@ def read_vocabulary(path: Path) -> Vocabulary:
     try:
         with np.load(path, allow_pickle=False) as held:
             motions, card = torch.from_numpy(held["motions"]), json.loads(held["card"].tobytes())
-    except (KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(f"{path} is no vocabulary ({error}); make one with python -m recipes.vocabulary.") from None
     if motions.ndim != 4 or len(motions) != len(AgentKind) or motions.shape[-1] != 3 or not motions.isfinite().all():
         raise ValueError(

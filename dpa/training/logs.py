@@ -162,7 +162,7 @@ class LogItems:
         made = log_items([drawn[place].log for place in new], self.tokenizer) if new else []
         logs = {place: self._keep(drawn[place].key, item) for place, item in zip(new, made, strict=True)}
         items = [_of_agents(logs.get(place, each.log), each.chosen) for place, each in enumerate(drawn)]
-        if self.noise:
+        if self.noise and items:
             noise = [each.noise for each in drawn]
             contexts = [item.context for item in items]
             items = log_items(contexts, self.tokenizer, noise=self.noise, recovery=self.recovery, drawn=noise)

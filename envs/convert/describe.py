@@ -36,7 +36,7 @@ def write_card(folder: Path, manifest: Manifest) -> None:
     }
     errors = [skip["error"] for skip in manifest.skipped]
     text = card_text(card, "Scenes", facts, errors, manifest.notes)
-    write_bytes(folder / CARD_FILE, text.encode())
+    write_bytes(folder / CARD_FILE, text.encode(errors="backslashreplace"))  # of a folder not named in UTF-8
     save_picture(folder / CARD_PICTURE, [draw_card(card)])
 
 

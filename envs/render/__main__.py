@@ -32,11 +32,13 @@ def main(arguments: list[str] | None = None) -> None:
         scene = store[store.find(chosen.scene)]
     except SceneError as error:
         parser.error(str(error))
-    out = chosen.out or Path(f"{scene.scene_id}.png")
+    out = chosen.out or Path(scene.scene_id.replace("/", "_") + ".png")
     if out.suffix.lower() not in WRITERS:
         parser.error(f"--out must end in {', '.join(WRITERS)}, got {out}")
     if not 0 <= chosen.step < LOG_STEPS:
         parser.error(f"--step must lie in 0 to {LOG_STEPS - 1}, got {chosen.step}")
+    if chosen.pixels < 1:
+        parser.error(f"--pixels must be 1 or more, got {chosen.pixels}")
     view = fit_view(scene)
     if chosen.radius is not None:
         if not math.isfinite(chosen.radius) or chosen.radius <= 0:
@@ -48,6 +50,8 @@ def main(arguments: list[str] | None = None) -> None:
         save_picture(out, progress(frames, "draw", total=len(steps), unit="frame", disable=len(steps) == 1))
     except ImportError as error:
         parser.error(str(error))
+    except OSError as error:
+        parser.error(f"{out} cannot be written: {error}")
     sys.stdout.write(f"{out}\n")
 
 

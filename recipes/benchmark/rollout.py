@@ -144,11 +144,13 @@ def measure(options: dict[str, Any]) -> list[dict[str, Any]]:
     """Run the part and print its tables.
 
     Raises:
-        ValueError: a number below 1.
+        ValueError: a number below 1, or a model whose decoding is not compiled, and is to be.
     """
     for name in ("agents", "rollouts", "scenes", "threads", "repeats"):
         if options[name] < 1:
             raise ValueError(f"--{name} must be 1 or more, got {options[name]}.")
+    if options["compile"] and not named_model(options["model"]).compiles:
+        raise ValueError(f"--compile: decoding of {options['model']} is not compiled; leave it out.")
     main = Case("incremental", **{key: value for key, value in options.items() if key not in ("sweep", "compile")})
     kinds = ("incremental", "collector", "naive", "uncached", "ranked", *(("compiled",) if options["compile"] else ()))
     cases = [replace(main, how=how) for how in kinds]

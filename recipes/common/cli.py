@@ -48,6 +48,7 @@ def recipe(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
                 f"{name} runs in one process and torchrun has started {ranks.world_size}; start it with python -m "
                 f"{name}. Training is what torchrun is for: recipes.pretrain and recipes.align."
             )
+        check_output(cfg)
         main(cfg)
 
     return ranked_recipe(alone)
@@ -111,14 +112,34 @@ def check_resources(cfg: DictConfig) -> None:
         check_backend(cfg.logger.backend)
     if cfg.get("json") is not None and Path(cfg.json).is_dir():
         raise ValueError(f"json={cfg.json} is a folder; name a file.")
-    if not re.fullmatch(r"cpu|cuda(:\d+)?", str(cfg.device)):
-        raise ValueError(f"device must be cpu, cuda or cuda:N, got {cfg.device!r}.")
+    check_device(cfg.device)
     torch.set_num_threads(cfg.threads)
     keep_freed_memory()
-    if torch.device(cfg.device).type == "cuda" and not torch.cuda.is_available():
-        raise ValueError(f"device={cfg.device}: torch {torch.__version__} finds no GPU here; say device=cpu.")
-    if (index := torch.device(cfg.device).index) is not None and index >= torch.cuda.device_count():
-        raise ValueError(f"device={cfg.device}: there are {torch.cuda.device_count()} GPUs, counted from 0.")
+
+
+def check_device(device: Any) -> None:
+    """Refuse a device that is not there.
+
+    Raises:
+        ValueError: it is not.
+    """
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", str(device)):
+        raise ValueError(f"device must be cpu, cuda or cuda:N, got {device!r}.")
+    if torch.device(device).type == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"device={device}: torch {torch.__version__} finds no GPU here; say device=cpu.")
+    if (index := torch.device(device).index) is not None and index >= torch.cuda.device_count():
+        raise ValueError(f"device={device}: there are {torch.cuda.device_count()} GPUs, counted from 0.")
+
+
+def check_output(cfg: DictConfig) -> None:
+    """Refuse to write into the folder of a training, whose curves and options would be lost.
+
+    Raises:
+        ValueError: ``output`` is one.
+    """
+    output = cfg.get("output")
+    if output is not None and any(Path(output, name).exists() for name in ("policy.pt", "checkpoints")):
+        raise ValueError(f"output={output} holds a training, whose curves would be lost; name another folder.")
 
 
 def check_steps(section: DictConfig, name: str) -> None:

@@ -115,7 +115,7 @@ class TimedDistance:
         >>> from dpa.ranking import log_trajectory
         >>> scene, timed = straight_road(2), TimedDistance(DisplacementDistance())
         >>> ranking = timed(scene, log_trajectory(scene, 80)[None], None)
-        >>> timed.seconds > 0 and timed.describe() == DisplacementDistance().describe()
+        >>> timed.seconds > 0 and timed.on_device and timed.describe() == DisplacementDistance().describe()
         True
     """
 

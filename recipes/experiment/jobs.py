@@ -131,7 +131,7 @@ def rerank_job(cfg: DictConfig, seed: int, source: str, ranking: str) -> None:
     runs, scenes = runs_of(cfg), open_splits(cfg.scenes).train
     section = ranking_options(cfg.collection.ranking, cfg.rankings[ranking])
     given, made = (runs.preferences(seed, "train", source, name) for name in (None, ranking))
-    rerank(section, scenes, runs.policy(seed, source), given, made)
+    rerank(section, scenes, runs.policy(seed, source), given, made, cfg.device)
 
 
 def align_job(cfg: DictConfig, seed: int, method: str) -> dict[str, float]:

@@ -66,11 +66,12 @@ class Sight:
         """D: numbers that are seen of an agent at a step."""
         return width_of(self.road)
 
-    def __call__(self, each: Rolled, log: Tensor) -> Motions:
-        """See a scene's rollouts, and its log as ``[A, 80, 4]``."""
+    def __call__(self, each: Rolled, log: Tensor, decision_steps: int = 1) -> Motions:
+        """See a scene's rollouts, and its log as ``[A, 80, 4]``, which may have been decoded from tokens."""
         ego = each.controlled.nonzero()[:, 0]
         both = torch.cat((log[None].to(each.trajectories), each.trajectories))
-        values, valid = observed_motion(each.scene, both, ego=ego, stride=self.stride, road=self.road)
+        looks = {"stride": self.stride, "road": self.road, "decision_steps": decision_steps}
+        values, valid = observed_motion(each.scene, both, ego=ego, **looks)
         return Motions(values[:1], values[1:], valid)
 
 

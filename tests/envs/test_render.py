@@ -191,6 +191,8 @@ def test_the_command_finds_a_scene_by_id_and_by_index(store: Path, tmp_path: Pat
         ["--scene", "0", "--radius", "-3"],
         ["--scene", "0", "--step", "91"],
         ["--scene", "0", "--out", "scene.svg"],
+        ["--scene", "0", "--pixels", "0"],
+        ["--scene", "0", "--out", "nowhere/scene.png"],
     ],
 )
 def test_the_command_refuses_what_it_cannot_draw(

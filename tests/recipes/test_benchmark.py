@@ -160,9 +160,24 @@ def test_the_naive_decoder_decodes_the_same(kind: type[MotionActor]) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", ["{", "[]", '{"rows": [{"how": "naive", "agent_steps_per_second": 1}], "options": {}}']
+    "content", ["{", "[]", '{"rows": []}', '{"rows": [{"how": "naive", "agent_steps_per_second": 1}], "options": {}}']
 )
 def test_a_plan_without_rates_is_refused(content: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "rates.json").write_text(content)
     assert plan_main([str(tmp_path / "rates.json")]) == 2
     assert "rates.json" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [
+        (["--json", "{folder}"], "is a folder; name a file"),
+        (["--device", "gpu"], "device must be cpu, cuda or cuda:N, got 'gpu'"),
+        (["--model", "smart_nano", "--compile"], "decoding of smart_nano is not compiled"),
+    ],
+)
+def test_what_cannot_be_measured_or_written_is_told_before_it_is_measured(
+    more: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["rollout", *(each.format(folder=tmp_path) for each in more)]) == 2
+    assert told in capsys.readouterr().err

@@ -75,6 +75,17 @@ def test_a_figure_is_written(look: Callable, tmp_path: Path, more: tuple[str, ..
         assert picture.width > 800
 
 
+def test_rollouts_of_any_ranking_are_drawn_and_couplings_of_one_that_couples_alone(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path
+) -> None:
+    files = (f"policy={runs / 'reference/policy.pt'}", f"preferences={runs / 'preferences'}", "split=eval")
+    again = options("rerank", *files, "ranking=displacement", f"output={tmp_path / 'other'}")
+    assert run("rerank", *again).status == 0
+    given = options("play", files[0], f"preferences={tmp_path / 'other'}", *files[2:], f"output={tmp_path / 'a.png'}")
+    assert run("look", *given, "scene=0", "figure=rollouts", "each=2").status == 0
+    assert_refused(run("look", *given, "scene=0"), "was ranked by displacement", "say figure=rollouts")
+
+
 def test_a_scene_may_be_given_by_its_id(look: Callable, stores: Path) -> None:
     assert look(f"scene={SceneStore(stores / 'eval').scene_ids[2]}").status == 0
 

@@ -19,7 +19,7 @@ from dpa.training.checkpoint import CheckpointError, load_policy, save_policy
 from envs.files import write_json
 from envs.sources.synthetic import straight_road
 from envs.store import SceneStore
-from recipes.common.cli import CONFIG, build, finished, recipe
+from recipes.common.cli import CONFIG, build, check_output, finished, recipe
 from recipes.common.limits import LIMITS, check_limits
 from recipes.common.models import (
     TOKENIZERS,
@@ -512,6 +512,14 @@ def test_more_pairs_than_rollouts_are_refused(run: Callable, options: Callable, 
     command = options("align", f"policy={policy}", f"preferences={store}", f"output={tmp_path / 'out'}")
     command.append("method.data.num=8")
     assert_refused(run("align", *command), "method.data.num=8 needs 16 rollouts of a scene and there are 4")
+
+
+@pytest.mark.parametrize("kept", ["policy.pt", "checkpoints"])
+def test_a_study_keeps_out_of_the_folder_of_a_training(kept: str, tmp_path: Path) -> None:
+    (tmp_path / kept).mkdir()
+    with pytest.raises(ValueError, match=f"output={tmp_path} holds a training"):
+        check_output(OmegaConf.create({"output": str(tmp_path)}))
+    check_output(OmegaConf.create({"output": str(tmp_path / "study")}))
 
 
 def test_a_section_becomes_the_arguments_of_a_class() -> None:

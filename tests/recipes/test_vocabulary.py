@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -39,8 +40,18 @@ def test_a_grid_is_a_vocabulary_too_and_another_maker_is_refused(
     assert run("vocabulary", *of, "vocabulary.maker=grid").status == 0
     motions, card = read_vocabulary(path)
     assert card["maker"] == "grid" and 2 < motions.shape[1] <= 24
-    outcome = run("vocabulary", *of, "vocabulary.maker=k_means")
-    assert outcome.status == 2 and "must be one of k_disks, grid, got 'k_means'" in outcome.err
+    wrong = {
+        "vocabulary.maker=k_means": "must be one of k_disks, grid, got 'k_means'",
+        "vocabulary.size=0": "vocabulary.size must be 1 or more, got 0",
+        "vocabulary.radius=-0.1": "vocabulary.radius must be above 0, got -0.1",
+        "vocabulary.steps=100": "vocabulary.steps must be from 1 to 10, got 100",
+    }
+    for option, told in wrong.items():
+        outcome = run("vocabulary", *of, option)
+        assert outcome.status == 2 and told in outcome.err, outcome.err
+    np.save(tmp_path / "motions.npy", motions.numpy())
+    with pytest.raises(ValueError, match="motions.npy is no vocabulary"):
+        read_vocabulary(tmp_path / "motions.npy")
 
 
 def trained(run: Callable, options: Callable, folder: Path, *more: str) -> Path:

@@ -79,6 +79,13 @@ def test_a_ranking_on_the_device_is_that_of_the_cpu_and_reads_back_no_more_than_
         assert mine.device.type == DEVICE and torch.equal(mine.cpu(), theirs)
 
 
+def test_what_a_coupling_pays_is_told_on_the_device(case: tuple, there: Pretended) -> None:
+    made, rollouts, controlled = case
+    distance, ego = PreferenceDistance(method="sinkhorn", stride=5), controlled.nonzero()[:, 0]
+    want = distance.couple(made, rollouts, ego).paid
+    assert torch.equal(distance.couple(made, rollouts.to(DEVICE), ego).paid.cpu(), want)
+
+
 def test_a_scene_that_ranks_nobody_does_so_on_the_device(case: tuple, there: Pretended) -> None:
     made, rollouts, controlled = case
     got = PreferenceDistance(method="sinkhorn")(made, rollouts.to(DEVICE), torch.zeros_like(controlled))

@@ -122,6 +122,17 @@ def test_rows_that_begin_again_alone_do_so_on_the_device(scene: Callable[..., Sc
             assert_same(want, again(DEVICE))
 
 
+def test_an_environment_that_has_begun_may_be_moved(scene: Callable[..., Scene]) -> None:
+    """TorchRL's collectors do so, and ``check_env_specs`` has begun it."""
+    made = TrafficEnv([scene(4, seed=0)], num_scenes=1, num_rollouts=2, signals=("offroad",))
+    want = made.reset()
+    with torch.no_grad(), Pretended():
+        moved = made.to(DEVICE)
+        assert moved is made
+        assert_same(want, moved.reset())
+        moved.step(moved.rand_action(moved.reset()))
+
+
 @pytest.mark.parametrize("spoken", ["verlet", "k_disks"])
 def test_a_policy_that_stays_near_the_log_does_so_on_the_device(spoken: str, scene: Callable[..., Scene]) -> None:
     scenes, model = [scene(4, seed=0)], smallest("motionlm", TOKENIZERS[spoken]()).eval()

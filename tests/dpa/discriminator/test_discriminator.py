@@ -46,6 +46,13 @@ def of_log(scene: Scene, **options) -> tuple[Tensor, Tensor]:
 
 
 # --- what is seen ---------------------------------------------------------------------------------------------------
+def test_of_a_log_through_tokens_the_decision_with_the_hole_is_not_seen() -> None:
+    scene = straight_road(1, speed=10.0)
+    scene.agents.valid[0, CURRENT_STEP + 8] = False
+    seen = [int(of_log(scene, stride=1, decision_steps=steps)[1].sum()) for steps in (1, 5)]
+    assert seen == [7, 5]
+
+
 def test_own_motion_is_speed_turn_and_acceleration_in_the_own_frame() -> None:
     accelerating = torch.stack((2 * TIME + TIME**2, torch.full_like(TIME, 1.0), torch.zeros_like(TIME)), -1)[None]
     lane = torch.tensor([[-100.0, 1.0], [200.0, 1.0]])

@@ -94,6 +94,25 @@ def test_a_store_grows_over_several_runs_and_keeps_each_scene_once(tmp_path: Pat
     assert verify(tmp_path) == []
 
 
+def test_options_written_as_1_and_as_1_0_fill_one_store(tmp_path: Path) -> None:
+    groups = example_groups(4)
+    for top_p, some in ((1.0, groups[:2]), (1, groups[2:])):
+        origin = dataclasses.replace(example_provenance(), sampling={"top_p": top_p})
+        with PreferenceWriter(tmp_path, origin) as writer:
+            writer.append(some)
+    assert PreferenceStore(tmp_path).scenes.tolist() == [0, 1, 2, 3]
+
+
+def test_groups_are_asked_for_by_position_alone_or_by_a_mask(tmp_path: Path) -> None:
+    with PreferenceWriter(tmp_path, example_provenance()) as writer:
+        writer.append(example_groups(4))
+    store = PreferenceStore(tmp_path)
+    assert store[store.scenes >= 2][keys.SCENE].tolist() == [2, 3]
+    assert store[torch.tensor(1)][keys.SCENE].tolist() == store[store.scenes.numpy()[1]][keys.SCENE].tolist() == [1]
+    with pytest.raises(IndexError, match=r"one value for each of 4, got shape \(2,\)"):
+        store[torch.tensor([True, False])]
+
+
 def test_of_two_open_writers_the_first_to_store_a_scene_wins(tmp_path: Path) -> None:
     mine, theirs = example_groups(2), example_groups(2)
     theirs[keys.ADE] += 1

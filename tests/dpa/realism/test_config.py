@@ -34,6 +34,15 @@ def test_an_unknown_name_is_refused_with_the_known_ones() -> None:
         RealismConfig.load("1999")
 
 
+def test_a_part_of_which_nothing_counts_is_refused(tmp_path: Path) -> None:
+    lines = (FOLDER / "2024.yaml").read_text().splitlines()
+    kinematic = ("linear_", "angular_")
+    without = [line.replace("0.05}", "0}") if line.strip().startswith(kinematic) else line for line in lines]
+    (tmp_path / "mine.yaml").write_text("\n".join(without))
+    with pytest.raises(ValueError, match="weighs nothing of kinematic.*give one of linear_speed, .*above 0"):
+        RealismConfig.load(tmp_path / "mine.yaml")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -49,6 +58,10 @@ def test_an_unknown_name_is_refused_with_the_known_ones() -> None:
         ),
         ("last_ttc", "first_ttc", r"quirks must be one of .*last_ttc.*, got 'first_ttc'"),
         ("traffic_lights: true", "traffic_lights: 1", r"traffic_lights must be of type bool, got 1"),
+        ("bins: 10", "bins: 0", r"mine\.yaml: continuous\.linear_speed: bins must be 1 or more, got 0"),
+        ("high: 25.0", "high: -1.0", r"low must be less than high, got 0\.0 and -1\.0"),
+        ("pseudocount: 0.1", "pseudocount: -1", r"pseudocount must be 0 or more, got -1"),
+        ("weight: 0.05", "weight: .nan", r"weight must be 0 or more, got nan"),
     ],
 )
 def test_a_wrong_file_is_refused_with_what_is_wrong(tmp_path: Path, old: str, new: str, message: str) -> None:

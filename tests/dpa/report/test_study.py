@@ -397,7 +397,7 @@ def test_stages_cards_and_the_way_to_make_it_again_are_there(page: Page) -> None
     wanted = ("recipes.compare experiment=methods", "torch 2.13.0", "Linux x86_64, 2 CPU cores", "2026-11-21")
     for each in (*wanted, "worker time1 h 32 min", "code0123abc"):
         assert each in page.text
-    assert table(page, "method", "optimiser steps")[0] == ["DPA-OMF", "60", "960", "reference"]
+    assert table(page, "method", "steps")[0] == ["DPA-OMF", "60", "960", "reference"]
 
 
 def test_the_scenes_of_every_split_have_a_data_card(page: Page) -> None:

@@ -272,6 +272,12 @@ def test_an_agent_that_is_not_present_changes_nothing() -> None:
     assert measured(more, rollouts) == measured(scene, rollouts)
 
 
+@pytest.mark.parametrize("steps", [1, 4, 5, 7, 10, 16])
+def test_rollouts_of_any_length_are_measured(steps: int) -> None:
+    scene = crossing(0.5)
+    assert measured(scene, log_of(scene)[:, :, :steps]).keys() == set(MEASURES)
+
+
 def test_trajectories_that_do_not_fit_are_refused() -> None:
     scene = straight_road(2)
     log, everybody = log_of(scene), torch.ones(2, dtype=torch.bool)
@@ -297,6 +303,14 @@ def test_the_logs_of_a_store_tell_by_class_who_leaves_the_road(
     assert ["off-road,", "vehicle", "0.0000", "of", "1", "agents"] in told
     assert ["off-road,", "pedestrian", "0.6667", "of", "3", "agents"] in told
     assert not any("cyclist" in line for line in told)
+
+
+def test_no_scenes_to_measure_are_refused(
+    tmp_path: Path, write_store: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_store(tmp_path / "store", [straight_road(1)])
+    with pytest.raises(SystemExit, match="--limit must be 1 or more, got 0"):
+        main([str(folder), "--limit", "0"])
 
 
 if __name__ == "__main__":

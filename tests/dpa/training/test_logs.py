@@ -44,6 +44,12 @@ def shown(made: LogItems, draws: range | list[int]) -> list[list[Item]]:
     ]
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_of_no_scenes_there_are_no_items(noise: float) -> None:
+    """More ranks than tuning scenes leave some ranks without any."""
+    assert logs(noise=noise).collate([]) == []
+
+
 def equal(one: Item, other: Item) -> bool:
     tensors = all(torch.equal(*pair) for pair in zip(one[1:], other[1:], strict=True))
     return tensors and bool((one.context == other.context).all())
