@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import io
 import json
 import math
@@ -49,33 +48,6 @@ def whole(path: Path) -> Iterator[Path]:
         sync(path.parent)
     finally:
         part.unlink(missing_ok=True)
-
-
-@contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
-    """Keep other commands out of a folder as long as the block runs.
-
-    Raises:
-        ValueError: another one is at work there.
-
-    Examples:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder, alone_in(Path(folder)):
-        ...     try:
-        ...         alone_in(Path(folder)).__enter__()
-        ...     except ValueError as error:
-        ...         "at work" in str(error)
-        True
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ValueError(
-                f"another command is at work in {folder}; wait for it, or name another output folder."
-            ) from None
-        yield
 
 
 def sync(path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from numbers import Integral
+from numbers import Number
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,11 +27,13 @@ def positions(index: int | Iterable[int] | Tensor, count: int) -> NDArray[np.int
         >>> positions([2, 0], 3), positions(1, 3), positions(np.array([2, 5, 7]) > 4, 3)
         (array([2, 0]), array([1]), array([1, 2]))
     """
-    given = np.asarray(index if isinstance(index, Integral | Tensor | np.ndarray) else list(index))
+    if isinstance(index, Tensor):
+        index = index.detach().cpu().numpy()
+    given = np.asarray(index if isinstance(index, Number | np.generic | np.ndarray) else list(index))
     if given.dtype == bool:
         if given.shape != (count,):
             raise IndexError(f"a mask has one value for each of {count}, got shape {given.shape}.")
         return np.flatnonzero(given)
-    if given.size and not np.issubdtype(given.dtype, np.integer):
-        raise IndexError(f"positions are whole numbers or a mask, got {given.dtype}.")
+    if given.ndim > 1 or (given.size and not np.issubdtype(given.dtype, np.integer)):
+        raise IndexError(f"positions are whole numbers or a mask, got shape {given.shape} of {given.dtype}.")
     return np.atleast_1d(given).astype(np.int64)

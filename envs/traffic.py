@@ -155,9 +155,12 @@ class TrafficEnv(EnvBase):
         rows = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
         if tensordict is not None and "_reset" in tensordict.keys():
             rows = tensordict["_reset"].reshape(self.batch_size)
+        unknown = self._scene < 0  # which have not begun, or not on this device
+        if unknown.any():
+            rows = rows | self._repeat(unknown.to(self.device))
         finished = rows.view(self.num_scenes, self.num_rollouts).all(-1).cpu()
         if finished.any():
-            self._load(finished | (self._scene < 0))
+            self._load(finished)
         self._recent = torch.where(rows[:, None, None, None], self._start, self._recent)
         self._step_count = torch.where(rows[:, None], 0, self._step_count)
         out = self._observe()

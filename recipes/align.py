@@ -113,10 +113,10 @@ def align(
         description=method.name,
         ranks=ranks,
     )
-    snapshots.check(run.first_step)
     saturation = SaturationWatch(method.loss, f"{section}.loss", run.state.setdefault(SATURATED, {}))
     described = {"method": method.name, "seed": seed, "options": decided_by}
     with run:
+        snapshots.check(run.first_step)
         tell(method, saturation.found, ranks)
         for look in looks if run.first_step == 0 else ():
             run.log(look(device), 0)
@@ -128,9 +128,9 @@ def align(
                 run.log(look(device))
             if ranks.main:
                 snapshots.keep(done, model, inputs.config, described)
-    if ranks.main:
-        write_policy(path, model, inputs.config, described)
-        write_result(result, path, decided_by, saturation)
+        if ranks.main:
+            write_policy(path, model, inputs.config, described)
+            write_result(result, path, decided_by, saturation)
     ranks.wait()
     return path
 

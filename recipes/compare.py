@@ -23,7 +23,8 @@ from omegaconf import DictConfig
 from dpa.models import Decoding
 from dpa.report.experiment import read_experiment, read_json
 from dpa.report.table import REFERENCE, print_table
-from envs.files import alone_in, write_json
+from envs.files import write_json
+from envs.locks import alone_in
 from recipes.alignment.data import ON_POLICY
 from recipes.common.cli import CONFIG, recipe
 from recipes.common.provenance import merged, provenance

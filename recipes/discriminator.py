@@ -28,7 +28,7 @@ from envs.episode import EpisodeOptions
 from envs.files import write_json
 from envs.progress import progress
 from envs.store import SceneStore
-from recipes.common.cli import CONFIG, build, finished, finite, plain, recipe
+from recipes.common.cli import CONFIG, build, finished, finite, plain, study_recipe
 from recipes.common.models import given_policies, open_policy, weights_digest
 from recipes.common.rankings import build_distance
 from recipes.common.rolled import Rolled, driven, driven_log
@@ -198,7 +198,7 @@ def check(cfg: DictConfig) -> None:
 
 
 @hydra.main(**CONFIG, config_name="discriminator")
-@recipe
+@study_recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.discriminator``."""
     check(cfg)

@@ -23,7 +23,7 @@ from envs.episode import EpisodeOptions
 from envs.files import write_json
 from envs.scene import AgentKind
 from envs.store import SceneStore
-from recipes.common.cli import CONFIG, plain, recipe
+from recipes.common.cli import CONFIG, plain, study_recipe
 from recipes.common.models import given_policies, open_policy, weights_digest
 from recipes.common.rolled import Rolled, driven, logs
 from recipes.common.scenes import open_splits
@@ -91,7 +91,7 @@ def tables(found: Mapping[str, Figures], names: Sequence[str]) -> Iterator[Study
 
 
 @hydra.main(**CONFIG, config_name="encounters")
-@recipe
+@study_recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.encounters``."""
     policies = given_policies(cfg)

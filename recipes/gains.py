@@ -24,7 +24,7 @@ from dpa.report.statistics import Interval, summary, unpaired_bootstrap
 from dpa.report.studies import plot_gains
 from dpa.report.study import Evaluations
 from dpa.report.table import to_markdown
-from recipes.common.cli import CONFIG, recipe
+from recipes.common.cli import CONFIG, study_recipe
 from recipes.common.models import num_parameters, open_policy
 from recipes.studies.tables import Cell, StudyTable, tell
 
@@ -128,7 +128,7 @@ def names_of(name: str | ListConfig, runs: Sequence[str]) -> list[str]:
 
 
 @hydra.main(**CONFIG, config_name="gains")
-@recipe
+@study_recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.gains``."""
     methods, output = list(cfg.methods), Path(cfg.output)

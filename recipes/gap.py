@@ -37,7 +37,7 @@ from envs.options import differences
 from envs.scene import STEP_SECONDS, Scene, SceneSource, select_agents
 from envs.seeding import make_generator
 from envs.store import SceneStore
-from recipes.common.cli import CONFIG, build, plain, recipe
+from recipes.common.cli import CONFIG, build, plain, study_recipe
 from recipes.common.models import given_policies, open_policy, weights_digest
 from recipes.common.rolled import Rolled, driven, logs, waiting
 from recipes.common.scenes import open_splits
@@ -168,7 +168,7 @@ def tables(
 
 
 @hydra.main(**CONFIG, config_name="gap")
-@recipe
+@study_recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.gap``."""
     policies = given_policies(cfg)

@@ -26,7 +26,7 @@ from dpa.training.seeding import seed_everything
 from envs.files import write_json
 from envs.sources.sumo.futures import Keeps
 from envs.store import SceneStore
-from recipes.common.cli import CONFIG, finite, mean_known, plain, recipe
+from recipes.common.cli import CONFIG, finite, mean_known, plain, study_recipe
 from recipes.common.models import (
     episode_options,
     fresh_policy,
@@ -156,7 +156,7 @@ def table(ladder: dict[str, dict], years: list[str]) -> StudyTable:
 
 
 @hydra.main(**CONFIG, config_name="ladder")
-@recipe
+@study_recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.ladder``."""
     policies = given_policies(cfg) if cfg.policies else {}

@@ -40,14 +40,7 @@ from recipes.experiment.runs import Run, RunFolder
 from recipes.experiment.stages import Stages, origins_beside, read_account
 from recipes.experiment.summary import Chosen, chosen_in, decoding_at, policy_of, summarise_experiment
 
-METHODS = (
-    "methods",
-    "rankings",
-    "experiment.setup",
-    "experiment.labels",
-    "experiment.published",
-    "experiment.axis.values",
-)
+METHODS = ("methods", "rankings", "experiment.setup", "experiment.labels", "experiment.published")
 """Options by method or by ranking: parts agree in those that they share."""
 APART = (
     "seeds", "reference", "trained", "output", "only", "scenes", "threads", "workers", "device", "logger", "pictures",
@@ -147,8 +140,8 @@ def merged_config(parts: Sequence[Part], output: Path, trained: Path | None) -> 
         raise ValueError(f"--trained {trained}: these parts have trained their policies themselves; leave it out.")
     cfg = OmegaConf.create(dict(parts[0].found.config))
     for each in METHODS:
-        if OmegaConf.select(cfg, each) is not None:
-            OmegaConf.update(cfg, each, _first(_select(part.found.config, each) for part in parts), merge=False)
+        OmegaConf.update(cfg, each, _first(_select(part.found.config, each) for part in parts), merge=False)
+    cfg.experiment.axis = _axis([part.found.config["experiment"]["axis"] for part in parts])
     cfg.logger.backend, cfg.logger.mode = "csv", "offline"  # what a part logged to need not be on this machine
     starts = _first(map(_references, parts))
     cfg.seeds = sorted(starts)
@@ -248,16 +241,23 @@ def _shared(config: Mapping[str, Any]) -> dict[str, Any]:
     unused = () if config["reference"] is None else ("pretraining",)
     for name in (*APART, *METHODS, *unused):
         section, _, key = name.rpartition(".")
-        holder = OmegaConf.select(kept, section) if section else kept
-        if holder is not None:
-            holder.pop(key, None)
+        (OmegaConf.select(kept, section) if section else kept).pop(key, None)
     return OmegaConf.to_container(kept)
 
 
-def _select(config: Mapping[str, Any] | None, name: str) -> Mapping[str, Any]:
+def _select(config: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     for key in name.split("."):
-        config = {} if config is None else config.get(key, {})
-    return {} if config is None else config
+        config = config[key]
+    return config
+
+
+def _axis(each: Sequence[Mapping[str, Any] | None]) -> Mapping[str, Any] | None:
+    """The axis of the first part, with the places that parts of the same axis have on it."""
+    first = each[0]
+    if first is None:
+        return None
+    same = [axis for axis in each if axis and all(axis[key] == first[key] for key in ("name", "log"))]
+    return {**first, "values": _first(axis["values"] for axis in same)}
 
 
 def _gather(parts: Sequence[Part], runs: RunFolder) -> None:

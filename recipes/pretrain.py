@@ -146,18 +146,18 @@ def pretrain(
             run.log({f"train/{key}": value for key, value in losses.items()} | {"train/gradient_norm": norm})
             if (step + 1) % options.tune_interval == 0 or step + 1 == options.steps:
                 look(run, model, best, tune, device, ranks)
-    if ranks.main:
-        made = {
-            "method": "reference",
-            "seed": seed,
-            "tune_nll": run.state["best_nll"],
-            "source": cfg.scenes.source,
-            "start": None if origin is None else origin.described,
-            "made_by": made_by,
-        }
-        write_policy(path, best, config, made)
-        told = {"policy": str(path), "num_scenes": len(splits.train), "tune_nll": run.state["best_nll"]}
-        write_json(result, {"options": decided_by} | told)
+        if ranks.main:
+            made = {
+                "method": "reference",
+                "seed": seed,
+                "tune_nll": run.state["best_nll"],
+                "source": cfg.scenes.source,
+                "start": None if origin is None else origin.described,
+                "made_by": made_by,
+            }
+            write_policy(path, best, config, made)
+            told = {"policy": str(path), "num_scenes": len(splits.train), "tune_nll": run.state["best_nll"]}
+            write_json(result, {"options": decided_by} | told)
     ranks.wait()
     return path
 

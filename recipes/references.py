@@ -24,7 +24,7 @@ from dpa.report.statistics import summary
 from dpa.report.studies import plot_references
 from dpa.training.loggers import read_curve
 from dpa.training.run import seconds_trained
-from recipes.common.cli import CONFIG, build, recipe
+from recipes.common.cli import CONFIG, build, study_recipe
 from recipes.common.models import given_policies, num_parameters, open_policy
 from recipes.common.scenes import open_splits
 from recipes.evaluate import evaluate
@@ -95,7 +95,7 @@ def measured(training: Training, result: dict[str, Any], parameters: int) -> lis
 
 
 @hydra.main(**CONFIG, config_name="references")
-@recipe
+@study_recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.references``."""
     policies = given_policies(cfg)

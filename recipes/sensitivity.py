@@ -25,7 +25,7 @@ from dpa.ranking.agreement import rank_correlation, same_order
 from dpa.report.statistics import Interval, summary
 from dpa.report.studies import plot_sensitivity
 from envs.files import write_json
-from recipes.common.cli import CONFIG, recipe
+from recipes.common.cli import CONFIG, study_recipe
 from recipes.common.models import given_policies
 from recipes.common.rolled import Rolled
 from recipes.common.scenes import open_splits
@@ -181,7 +181,7 @@ def title(low: float, high: float) -> str:
 
 
 @hydra.main(**CONFIG, config_name="sensitivity")
-@recipe
+@study_recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.sensitivity``."""
     if cfg.num_rollouts < SMALLEST_GROUP:

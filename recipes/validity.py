@@ -23,7 +23,7 @@ from dpa.realism import RealismConfig, realism_of_groups
 from dpa.report.statistics import Interval, paired_bootstrap, summary
 from dpa.report.studies import plot_validity
 from envs.files import write_json
-from recipes.common.cli import CONFIG, finite, recipe
+from recipes.common.cli import CONFIG, finite, study_recipe
 from recipes.common.models import given_policies
 from recipes.common.rolled import Rolled
 from recipes.common.scenes import open_splits
@@ -165,7 +165,7 @@ def _with_realism(measured: dict[str, list[dict]]) -> list[list[dict]]:
 
 
 @hydra.main(**CONFIG, config_name="validity")
-@recipe
+@study_recipe
 def main(cfg: DictConfig) -> None:
     """Entry point of ``python -m recipes.validity``."""
     if cfg.window < 1 or cfg.stride < 1 or cfg.window + cfg.stride > cfg.num_rollouts:

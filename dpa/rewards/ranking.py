@@ -46,8 +46,10 @@ class RealismRanking:
 
     def describe(self) -> dict[str, Any]:
         """The options that decide a ranking, ready for JSON; of a metric in a file its content as well."""
-        own = {"digest": judge(self.metric).digest} if self.metric.endswith(".yaml") else {}
-        return {"kind": "realism", **asdict(self), **own}
+        if not self.metric.endswith(".yaml"):
+            return {"kind": "realism", **asdict(self)}
+        name, digest = judge(self.metric).describe()
+        return {"kind": "realism", "metric": name, "digest": digest}
 
     def __call__(self, scene: Scene, trajectories: Tensor, controlled: Tensor | None = None) -> Ranking:
         """Rank rollouts of one scene (arguments of :meth:`~dpa.ranking.PreferenceDistance.__call__`).

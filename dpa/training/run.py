@@ -12,7 +12,7 @@ from typing import Any, Literal
 from dpa.training.checkpoint import Checkpointer, Stateful, capture, restore
 from dpa.training.distributed import ALONE, Ranks
 from dpa.training.loggers import Backend, make_logger, read_curve
-from envs.files import alone_in
+from envs.locks import alone_in
 from envs.options import differences
 from envs.progress import progress
 
@@ -64,6 +64,8 @@ class Run:
         description: of the progress bar.
         ranks: that train together, each with its own ``Run``. All go on from the same checkpoint, and the main one
             alone writes files and shows progress.
+
+    The folder is locked from here to the end of ``with run``, in which results are written too.
 
     Raises:
         ValueError: the folder holds a run with other options, another process trains there, or ranks do not see the

@@ -14,6 +14,7 @@ from dpa.losses.network import without_dropout
 from dpa.models import Contexts, MotionModel
 from dpa.preferences import PreferenceStore
 from envs.episode import EpisodeOptions
+from envs.options import differences
 from envs.store import SceneStore
 from recipes.alignment.likelihoods import make_probes, probe, probe_sides
 from recipes.common.models import open_policy
@@ -59,7 +60,8 @@ class Look:
     ) -> None:
         store = open_ranked_scenes(watch.preferences, watch.scenes)
         for name, mine in (("tokenizer", tokenizer), ("horizon", episode.horizon)):
-            if (other := getattr(store.provenance, name)) != mine:
+            other = getattr(store.provenance, name)
+            if differences({name: other}, {name: mine}):
                 raise ValueError(
                     f"{store.folder} has {name} {other}, and the policy in training {mine}; let a policy of the same "
                     "tokens roll the watched scenes out."

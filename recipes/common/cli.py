@@ -48,10 +48,20 @@ def recipe(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
                 f"{name} runs in one process and torchrun has started {ranks.world_size}; start it with python -m "
                 f"{name}. Training is what torchrun is for: recipes.pretrain and recipes.align."
             )
-        check_output(cfg)
         main(cfg)
 
     return ranked_recipe(alone)
+
+
+def study_recipe(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
+    """Like :func:`recipe`, for one that logs into ``output`` what it has found: not over the curves of a training."""
+
+    @functools.wraps(main)
+    def beside(cfg: DictConfig) -> None:
+        check_output(cfg)
+        main(cfg)
+
+    return recipe(beside)
 
 
 def ranked_recipe(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:

@@ -40,20 +40,16 @@ def build_distance(section: DictConfig, name: str) -> Distance:
         >>> build_distance(OmegaConf.create({"kind": "displacement", "measure": "final"}), "collection.ranking")
         DisplacementDistance(measure='final', aggregate='mean', agents='controlled')
     """
-    kind = _section(section, name).get("kind", "preference")
+    if not OmegaConf.is_dict(section):
+        raise ValueError(
+            f"{name} must be a section of options, got {section!r}; say {name}={{kind: {section}}}, or take a file of "
+            f"recipes/config/ranking by ranking@{name}=FILE."
+        )
+    kind = section.get("kind", "preference")
     if kind not in DISTANCES:
         raise ValueError(f"{name}.kind must be one of {sorted(DISTANCES)}, got {kind!r}.")
     options = {key: value for key, value in section.items() if key != "kind"}
     return build(DISTANCES[kind], OmegaConf.create(options), name)
-
-
-def _section(given: Any, name: str) -> DictConfig:
-    if not OmegaConf.is_dict(given):
-        raise ValueError(
-            f"{name} must be a section of options, got {given!r}; a file of recipes/config/ranking is taken by "
-            f"ranking@{name}={given}, and options are given one by one, as {name}.kind={given}."
-        )
-    return given
 
 
 def ranking_options(section: DictConfig, differing: DictConfig) -> DictConfig:
@@ -66,7 +62,7 @@ def ranking_options(section: DictConfig, differing: DictConfig) -> DictConfig:
         >>> ranking_options(section, OmegaConf.create({"kind": "displacement", "measure": "final"}))
         {'kind': 'displacement', 'measure': 'final'}
     """
-    if _section(differing, "an entry of rankings").get("kind", section.kind) != section.kind:
+    if not OmegaConf.is_dict(differing) or differing.get("kind", section.kind) != section.kind:
         return differing
     return OmegaConf.merge(section, differing)
 

@@ -49,7 +49,7 @@ class Setup:
         options = OmegaConf.merge(section, self.alignment)
         times = {
             "steps": self.scaled(options.steps),
-            "snapshots": [self.scaled(step) for step in options.snapshots],
+            "snapshots": list(dict.fromkeys(self.scaled(step) for step in options.snapshots)),
         }
         return OmegaConf.merge(options, times)
 
@@ -81,7 +81,6 @@ def kept(cfg: DictConfig) -> DictConfig:
             f"only must be methods of the experiment as in only=[{next(iter(cfg.methods))}], got {cfg.only!r}; there "
             f"are {', '.join(cfg.methods)}."
         )
-    levels({name: setup_of(cfg, name) for name in cfg.methods})
     named, cfg = list(cfg.only), copy.deepcopy(cfg)
     others = set(cfg.methods) - {each for name in named for each in behind(cfg, name)}
     told = (OmegaConf.select(cfg, f"experiment.{name}") for name in ("setup", "labels", "published", "axis.values"))
@@ -96,12 +95,26 @@ def kept(cfg: DictConfig) -> DictConfig:
     return cfg
 
 
-def behind(cfg: DictConfig, policy: str) -> list[str]:
-    """Methods that must run before a policy is there, its own last and each once; none for the reference."""
+def behind(cfg: DictConfig, policy: str, waiting: tuple[str, ...] = ()) -> list[str]:
+    """Methods that must run before a policy is there, its own last and each once; none for the reference.
+
+    Args:
+        cfg: with ``experiment.setup``.
+        policy: a method, or the reference.
+        waiting: methods that wait for it.
+
+    Raises:
+        ValueError: it waits for itself.
+    """
     if policy == REFERENCE:
         return []
+    if policy in waiting:
+        circle = ", ".join(waiting[waiting.index(policy) :])
+        raise ValueError(f"experiment.setup: {circle} need each other; one must start from the reference.")
     setup = setup_of(cfg, policy)
-    before = [*behind(cfg, setup.start), *behind(cfg, setup.expert or REFERENCE)]
+    before = [
+        each for source in (setup.start, setup.expert or REFERENCE) for each in behind(cfg, source, (*waiting, policy))
+    ]
     return [*dict.fromkeys(before), policy]
 
 

@@ -13,7 +13,8 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from dpa.models import Decoding
-from envs.files import alone_in, write_json
+from envs.files import write_json
+from envs.locks import alone_in
 from recipes.common.cli import CONFIG
 from recipes.compare import choose, train_policies
 from recipes.experiment import jobs
@@ -284,8 +285,11 @@ def test_a_method_comes_after_those_that_it_starts_from_or_learns_from() -> None
         (("methods.dpa_adef=null",), r"methods\.dpa_adef must be a section .* got None; to leave a method out"),
         (("experiment=competent", "alignment.staleness=1"), "methods.omf_on_policy: staleness=1 needs workers that"),
         (("experiment=competent", "only=[rloo]", "alignment.workers.count=2"), "2 workers need backend=process"),
-        (("collection.ranking=displacement",), r"is taken by ranking@collection\.ranking=displacement"),
-        (("+rankings.mine=displacement",), "an entry of rankings must be a section of options, got 'displacement'"),
+        (("collection.ranking=displacement",), r"say collection\.ranking={kind: displacement}, .* ranking@collection"),
+        (
+            ("+rankings.mine=displacement",),
+            r"rankings\.mine must be a section of options, got 'displacement'",
+        ),
     ],
 )
 def test_an_experiment_that_cannot_work_is_refused_before_any_work(options: tuple[str, ...], message: str) -> None:

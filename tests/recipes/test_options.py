@@ -19,7 +19,7 @@ from dpa.training.checkpoint import CheckpointError, load_policy, save_policy
 from envs.files import write_json
 from envs.sources.synthetic import straight_road
 from envs.store import SceneStore
-from recipes.common.cli import CONFIG, build, check_output, finished, recipe
+from recipes.common.cli import CONFIG, build, finished, recipe
 from recipes.common.limits import LIMITS, check_limits
 from recipes.common.models import (
     TOKENIZERS,
@@ -515,11 +515,11 @@ def test_more_pairs_than_rollouts_are_refused(run: Callable, options: Callable, 
 
 
 @pytest.mark.parametrize("kept", ["policy.pt", "checkpoints"])
-def test_a_study_keeps_out_of_the_folder_of_a_training(kept: str, tmp_path: Path) -> None:
+def test_a_study_keeps_out_of_the_folder_of_a_training(kept: str, run: Callable, tmp_path: Path) -> None:
     (tmp_path / kept).mkdir()
-    with pytest.raises(ValueError, match=f"output={tmp_path} holds a training"):
-        check_output(OmegaConf.create({"output": str(tmp_path)}))
-    check_output(OmegaConf.create({"output": str(tmp_path / "study")}))
+    outcome = run("gains", f"runs={tmp_path}", f"output={tmp_path}")
+    assert_refused(outcome, f"output={tmp_path} holds a training, whose curves would be lost")
+    assert "holds a training" not in run("gains", f"runs={tmp_path}", f"output={tmp_path / 'study'}").err
 
 
 def test_a_section_becomes_the_arguments_of_a_class() -> None:

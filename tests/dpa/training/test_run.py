@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 from pathlib import Path
 
@@ -56,10 +57,29 @@ def test_two_runs_in_one_folder_are_refused_before_the_second_writes(tmp_path: P
     def run() -> Run:
         return Run(tmp_path, {"net": nn.Linear(1, 1)}, config={}, total_steps=3, checkpoint_interval=1)
 
-    with run(), pytest.raises(ValueError, match=f"another command is at work in {tmp_path}"):
-        run()
+    def content() -> dict[str, bytes]:
+        return {str(path): path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+    with run() as first:
+        next(steps := first.steps())
+        next(steps)
+        before = content()
+        with pytest.raises(ValueError, match=f"another command is at work in {tmp_path}"):
+            run()
+        assert content() == before and any("checkpoints" in name for name in before)
     with run() as again:
-        assert list(again.steps()) == [0, 1, 2]
+        assert list(again.steps()) == [1, 2]
+
+
+def test_a_file_system_without_locks_is_told_and_trained_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("envs.locks.fcntl.flock", refuse)
+    assert train(tmp_path).first_step == 0
+    assert f"{tmp_path} cannot be locked (No locks available)" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("stop_at", [4, 5, 9])
