@@ -90,10 +90,10 @@ def test_rollouts_are_ranked_again_by_the_distance_of_that_name(monkeypatch: pyt
     monkeypatch.setattr(jobs, "open_splits", lambda _: SimpleNamespace(train="scenes"))
     monkeypatch.setattr(jobs, "rerank", lambda *args: given.extend(args))
     jobs.rerank_job(cfg, 3, "reference", "collision")
-    section, scenes, policy, store, made = given
+    section, scenes, policy, store, made, device = given
     seed = runs_of(cfg).root / "seed_3"
     assert section.features == "collision" and section.stride == cfg.collection.ranking.stride and scenes == "scenes"
-    assert policy == seed / "reference/policy.pt"
+    assert policy == seed / "reference/policy.pt" and device == cfg.device
     assert (store, made) == (seed / "preferences_train", seed / "preferences_train_by_collision")
 
 
