@@ -146,6 +146,7 @@ def merged_config(parts: Sequence[Part], output: Path, trained: Path | None) -> 
     starts = _first(map(_references, parts))
     cfg.seeds = sorted(starts)
     cfg.reference = None if None in starts.values() else [starts[seed] for seed in cfg.seeds]
+    cfg.only = None  # all that stands under methods
     cfg.output, cfg.trained = str(output), None if trained is None else str(trained)
     return cfg
 
