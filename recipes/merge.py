@@ -146,7 +146,8 @@ def merged_config(parts: Sequence[Part], output: Path, trained: Path | None) -> 
     starts = _first(map(_references, parts))
     cfg.seeds = sorted(starts)
     cfg.reference = None if None in starts.values() else [starts[seed] for seed in cfg.seeds]
-    cfg.only = None  # all that stands under methods
+    if "only" in cfg:  # which archives of earlier versions do not have
+        cfg.only = None
     cfg.output, cfg.trained = str(output), None if trained is None else str(trained)
     return cfg
 
