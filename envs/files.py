@@ -50,6 +50,26 @@ def whole(path: Path) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
+def check_file(path: str | Path | None, told: str) -> None:
+    """Refuse a result that cannot be written because a folder has its name, before any work; None asks for none.
+
+    Args:
+        path: where it is to be.
+        told: what stands before it on the command line, ``"json="`` or ``"--json "``.
+
+    Raises:
+        ValueError: it is a folder.
+
+    Examples:
+        >>> check_file(".", "--json ")
+        Traceback (most recent call last):
+            ...
+        ValueError: --json . is a folder; name a file.
+    """
+    if path is not None and Path(path).is_dir():
+        raise ValueError(f"{told}{path} is a folder; name a file.")
+
+
 def sync(path: Path) -> None:
     """Make what was written last: the content of a file, or the names in a folder."""
     handle = os.open(path, os.O_RDONLY)

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 from rich.console import Console
 from rich.table import Table
 
-from envs.files import write_json
+from envs.files import check_file, write_json
 
 STEPS = 80
 """Of an episode, of 0.1 s."""
@@ -157,8 +157,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = make_parser().parse_args(arguments)
     try:
         check_positive(options)
-        if options.json is not None and options.json.is_dir():
-            raise ValueError(f"--json {options.json} is a folder; name a file.")
+        check_file(options.json, "--json ")
         rates, memory, measured = read_rates(options.rollout)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

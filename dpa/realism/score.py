@@ -23,7 +23,7 @@ from scipy.stats import bootstrap
 from dpa.realism.config import RealismConfig
 from dpa.realism.files import Scenarios, read_rollouts
 from dpa.realism.metric import RealismResult, mean_result, realism
-from envs.files import write_json
+from envs.files import check_file, write_json
 from envs.progress import progress
 
 STANDARD_ROLLOUTS = 32
@@ -130,8 +130,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; returns the exit status."""
     options = _parser().parse_args(arguments)
     try:
-        if options.json is not None and options.json.is_dir():
-            raise ValueError(f"--json {options.json} is a folder; name a file.")
+        check_file(options.json, "--json ")
         results = score(
             options.scenario,
             options.rollouts,

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import torch
 
-from envs.files import write_json
+from envs.files import check_file, write_json
 from recipes.benchmark import device, realism, rollout, scenes, training, transport
 from recipes.common.cli import check_device
 from recipes.common.provenance import processor
@@ -49,8 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = vars(make_parser().parse_args(arguments))
     part, out = options.pop("part"), options.pop("json")
     try:
-        if out is not None and out.is_dir():
-            raise ValueError(f"--json {out} is a folder; name a file.")
+        check_file(out, "--json ")
         if part != "device":  # which may be pretended there
             check_device(options.get("device", "cpu"))
         rows = PARTS[part][0].measure(options)

@@ -24,6 +24,7 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, MissingMandat
 from dpa.training.distributed import started_ranks
 from dpa.training.loggers import check_backend
 from envs.allocator import keep_freed_memory
+from envs.files import check_file
 from envs.options import differences
 from recipes.common.kinds import check_kinds, taken_by
 from recipes.common.limits import check_added, check_limits
@@ -120,8 +121,7 @@ def check_resources(cfg: DictConfig) -> None:
     """
     if "logger" in cfg:
         check_backend(cfg.logger.backend)
-    if cfg.get("json") is not None and Path(cfg.json).is_dir():
-        raise ValueError(f"json={cfg.json} is a folder; name a file.")
+    check_file(cfg.get("json"), "json=")
     check_device(cfg.device)
     torch.set_num_threads(cfg.threads)
     keep_freed_memory()
