@@ -94,7 +94,7 @@ class TrafficEnv(EnvBase):
         self.scenes, self.episode = scenes, episode or EpisodeOptions()
         self.num_scenes, self.num_rollouts, self.order = num_scenes, num_rollouts, order
         self.num_agents = largest_scene(scenes, **self.episode.cast) if num_agents is None else num_agents
-        self._named = tuple(signals)
+        self._named = (signals,) if isinstance(signals, str) else tuple(signals)
         self._cursor = 0
         self._generator = torch.Generator()
         self._begin()

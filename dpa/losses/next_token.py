@@ -75,9 +75,9 @@ class NextTokenLoss(LossModule):
 
         context: NestedKey = CONTEXT
         tokens: NestedKey = keys.TOKENS
-        labels: NestedKey = keys.TOKENS
+        labels: NestedKey | None = None
         token_valid: NestedKey = keys.TOKEN_VALID
-        learnt: NestedKey = keys.TOKEN_VALID
+        learnt: NestedKey | None = None
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
@@ -111,9 +111,15 @@ class NextTokenLoss(LossModule):
     @property
     def in_keys(self) -> list[NestedKey]:
         """Where the input lies, in the order in which plain tensors are taken."""
-        accepted = self.tensor_keys
-        read = (accepted.context, accepted.tokens, accepted.labels, accepted.token_valid, accepted.learnt)
+        accepted, (labels, learnt) = self.tensor_keys, self._imitated
+        read = (accepted.context, accepted.tokens, labels, accepted.token_valid, learnt)
         return list(dict.fromkeys(read))
+
+    @property
+    def _imitated(self) -> tuple[NestedKey, NestedKey]:
+        """Keys of the labels, and of which of them count."""
+        accepted = self.tensor_keys
+        return accepted.labels or accepted.tokens, accepted.learnt or accepted.token_valid
 
     def _forward_value_estimator_keys(self, **_: object) -> None:
         """There is no value estimator."""
@@ -125,8 +131,8 @@ class NextTokenLoss(LossModule):
         tokens, valid = tensordict[accepted.tokens], tensordict[accepted.token_valid]
         batch = network_input(tensordict[accepted.context], tokens, valid)
         logits = logits_under(self.actor_network_params, self.actor_network, batch)
-        labels = tensordict[accepted.labels]
-        learnt, says = tensordict[accepted.learnt], distribution_of(self.actor_network)
+        labels, learnt = (tensordict[key] for key in self._imitated)
+        says = distribution_of(self.actor_network)
         loss = masked_mean(says.surprise(logits, labels, self.label_smoothing), learnt)
         with torch.no_grad():
             hit = says.hit(logits, labels).to(logits.dtype)

@@ -96,6 +96,8 @@ class RolloutCollector(BaseCollector):
         try:
             self._begin()
             while self._next < self._known:
+                if self.pre_collect_hook is not None:
+                    self.pre_collect_hook()
                 while self._next not in self._made:
                     self._feed()
                     self._take(*self._crew.wait())
@@ -105,6 +107,8 @@ class RolloutCollector(BaseCollector):
                 self._next += 1
                 if self.max_staleness:
                     self._feed()  # who is through goes on while the caller does
+                if self.post_collect_hook is not None:
+                    self.post_collect_hook(batch)
                 yield batch
         finally:
             self.shutdown()
@@ -168,23 +172,34 @@ class RolloutCollector(BaseCollector):
     def update_policy_weights_(
         self,
         policy_or_weights: nn.Module | TensorDictBase | Mapping[str, Tensor] | None = None,
-        **_: Any,
+        *,
+        weights: TensorDictBase | Mapping[str, Tensor] | None = None,
+        policy: nn.Module | None = None,
     ) -> None:
         """Drive with other weights from the next batch on.
 
         Args:
             policy_or_weights: the model, its weights as a tensordict or by their names in ``state_dict``; by default
                 those of the collector's own model, as they are now.
+
+        Keyword Args:
+            weights: the same by another name, as other collectors take them.
+            policy: likewise.
+
+        Raises:
+            ValueError: several of them, or weights that the model does not have or has in another shape.
         """
-        given = self.job.model if policy_or_weights is None else policy_or_weights
-        if isinstance(given, nn.Module):
-            given = given.state_dict()
-        elif isinstance(given, TensorDictBase):
-            given = given.flatten_keys(".").to_dict()
+        told = [each for each in (policy_or_weights, weights, policy) if each is not None]
+        if len(told) > 1:
+            raise ValueError("say one of policy_or_weights, weights and policy.")
+        given = _by_name(told[0] if told else self.job.model)
         known = self.job.model.state_dict()
         if not given.keys() <= known.keys():
             raise ValueError(f"weights {sorted(given.keys() - known.keys())[:3]} are none of the model's.")
-        self._weights = {name: value.detach().clone() for name, value in (known | dict(given)).items()}
+        if other := [name for name, value in given.items() if value.shape != known[name].shape]:
+            shapes = f"{list(given[other[0]].shape)}, and the model's are {list(known[other[0]].shape)}"
+            raise ValueError(f"weights {other[0]} are {shapes}; give those of a model of the same size.")
+        self._weights = {name: value.detach().clone() for name, value in (known | given).items()}
         self._changed()
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
@@ -218,6 +233,12 @@ class RolloutCollector(BaseCollector):
         if self._crew is not None:
             self._crew.close()
             self._crew = None
+
+
+def _by_name(given: nn.Module | TensorDictBase | Mapping[str, Tensor]) -> dict[str, Tensor]:
+    if isinstance(given, nn.Module):
+        return dict(given.state_dict())
+    return given.flatten_keys(".").to_dict() if isinstance(given, TensorDictBase) else dict(given)
 
 
 def make_collector(

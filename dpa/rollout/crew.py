@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import copy
 import multiprocessing
-from collections.abc import Mapping
+import pickle
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from multiprocessing import connection
 from typing import Any, Literal, NamedTuple, Protocol
@@ -152,9 +153,7 @@ class ProcessCrew:
         try:
             arrays, error = self._hands[worker].pipe.recv()
         except (EOFError, OSError):  # the other end is gone
-            self._end(worker)
-            self._hands[worker] = self._start(worker)
-            return worker, Outcome()
+            return worker, self._replace(worker)
         return worker, Outcome(None if arrays is None else _from_arrays(*arrays), error)
 
     def update(self, weights: Mapping[str, Tensor] | None, seed: int) -> None:
@@ -168,6 +167,22 @@ class ProcessCrew:
         """See :class:`Crew`."""
         for worker in range(self.size):
             self._end(worker)
+
+    def _replace(self, worker: int) -> Outcome:
+        """What became of a worker that is gone: killed, it has a successor; one that ended by itself is an error."""
+        process = self._hands[worker].process
+        process.join(GRACE)
+        status = process.exitcode
+        self._end(worker)
+        if status is not None and status > 0:
+            return Outcome(
+                error=ChildProcessError(
+                    f"a worker ended with exit status {status} before it could answer; what it wrote says why. A "
+                    'script that starts workers needs `if __name__ == "__main__":` around what it does.'
+                )
+            )
+        self._hands[worker] = self._start(worker)
+        return Outcome()
 
     def _start(self, worker: int) -> _Hand:
         context = multiprocessing.get_context("spawn")  # a forked process would inherit the locks of torch's threads
@@ -184,6 +199,10 @@ class ProcessCrew:
         pipe.close()
         process.kill()
         process.join()
+
+
+GRACE = 5.0
+"""Seconds in which a worker whose pipe is closed may end by itself."""
 
 
 class _Hand(NamedTuple):
@@ -203,24 +222,35 @@ def _serve(pipe: connection.Connection, job: RolloutJob, threads: int) -> None:
     end_with_parent()
     torch.set_num_threads(threads)
     keep_freed_memory()
-    worker = RolloutWorker(job)
+    worker, failed = _attempt(RolloutWorker, job)
     try:
         while True:
             message = pipe.recv()
             if isinstance(message, RolloutTask):
-                pipe.send(_answer(worker, message))
-            else:
+                pipe.send((None, failed) if failed else _attempt(lambda task: _to_arrays(worker.run(task)), message))
+            elif not failed:
                 weights, seed = message
-                worker.update(weights and {name: torch.from_numpy(value) for name, value in weights.items()}, seed)
+                arrays = weights and {name: torch.from_numpy(value) for name, value in weights.items()}
+                _, failed = _attempt(worker.update, arrays, seed)
     except (EOFError, KeyboardInterrupt):
         return
 
 
-def _answer(worker: RolloutWorker, task: RolloutTask) -> tuple[Any, Exception | None]:
+def _attempt(act: Callable[..., Any], *given: Any) -> tuple[Any, Exception | None]:
+    """What comes of it, or the error, which is raised again by whoever asked."""
     try:
-        return _to_arrays(worker.run(task)), None
-    except Exception as error:  # raised again by whoever asked
-        return None, error
+        return act(*given), None
+    except Exception as error:
+        return None, _as_sent(error)
+
+
+def _as_sent(error: Exception) -> Exception:
+    """An error whose constructor takes other arguments than it keeps cannot be read back."""
+    try:
+        pickle.dumps(copy.copy(error))  # copied as it is read back
+    except Exception:
+        return RuntimeError(f"{type(error).__name__}: {error}")
+    return error
 
 
 def _to_arrays(batch: TensorDictBase) -> tuple[dict[str, Any], list[int]]:

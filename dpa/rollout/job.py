@@ -82,6 +82,12 @@ class RolloutJob:
 
     def __post_init__(self) -> None:
         check_precision(self.precision)
+        if self.options.horizon > self.model.config.horizon:
+            horizon = self.model.config.horizon
+            raise ValueError(
+                f"episodes of {self.options.horizon} decisions need a policy that was made for as many, and this one "
+                f"has horizon={horizon}; give EpisodeOptions(horizon={horizon})."
+            )
 
 
 def make_env(part: Subset, options: EpisodeOptions, num_rollouts: int, device: str) -> TrafficEnv:

@@ -44,6 +44,7 @@ class RayCrew:
         self._job = self._ray.put(replace(job, model=copy.deepcopy(job.model).cpu(), device=device))
         self._latest: tuple[Any, int] = (None, job.seed)
         self._hands = [self._start() for _ in range(self.size)]
+        self._told = [self._tell(hand) for hand in self._hands]
         self._running: dict[Any, int] = {}
 
     def submit(self, worker: int, task: RolloutTask) -> None:
@@ -55,7 +56,8 @@ class RayCrew:
         ready = self._ready()
         worker = self._running.pop(ready)
         try:
-            return worker, Outcome(self._ray.get(ready))
+            _, batch = self._ray.get([self._told[worker], ready])  # weights that could not be loaded are told as well
+            return worker, Outcome(batch)
         except self._ray.exceptions.RayTaskError as error:
             return worker, Outcome(error=error.cause)
         except self._ray.exceptions.RayActorError as error:
@@ -68,6 +70,7 @@ class RayCrew:
 
     def _lost(self, worker: int) -> tuple[int, Outcome]:
         self._hands[worker] = self._start()
+        self._told[worker] = self._tell(self._hands[worker])
         return worker, Outcome()
 
     def _ready(self) -> Any:
@@ -90,8 +93,7 @@ class RayCrew:
             else self._ray.put({name: value.cpu() for name, value in weights.items()})
         )
         self._latest = (kept, seed)
-        for hand in self._hands:
-            hand.update.remote(*self._latest)
+        self._told = [self._tell(hand) for hand in self._hands]
 
     def close(self) -> None:
         """See :class:`~dpa.rollout.crew.Crew`; the cluster stays."""
@@ -99,9 +101,10 @@ class RayCrew:
             self._ray.kill(hand)
 
     def _start(self) -> Any:
-        hand = self._hire(self._job, self._threads)
-        hand.update.remote(*self._latest)
-        return hand
+        return self._hire(self._job, self._threads)
+
+    def _tell(self, hand: Any) -> Any:
+        return hand.update.remote(*self._latest)
 
 
 def _ray() -> Any:

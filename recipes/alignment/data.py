@@ -22,12 +22,13 @@ SIDES = {
     "adversarial": "pairs",
     "expert": "pairs",
     "closed_loop": "targets",
-    "own_pairs": "pairs",
+    "own_pairs": "pairs in parts",
     "own_groups": "groups",
 }
-"""Ways to learn from the rollouts of a scene (``config/method``), and what each gives: M pairs, M targets to imitate,
-two sets of any sizes, one ranking, whose nearer half is the preferred side and the rest the unpreferred one, or all
-rollouts, each with its advantage."""
+"""Ways to learn from the rollouts of a scene (``config/method``), and what each gives: M pairs (of rollouts made in the
+step they are passed in parts, as ``alignment.max_rows`` has room), M targets to imitate, two sets of any sizes, one
+ranking, whose nearer half is the preferred side and the rest the unpreferred one, or all rollouts, each with its
+advantage."""
 ROLLED = ("own_pairs", "own_groups")
 """Those of them that rank rollouts of the policy as it is, drawn anew in every step."""
 ON_POLICY = ("closed_loop", *ROLLED)

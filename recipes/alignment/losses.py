@@ -28,13 +28,13 @@ LOSSES: dict[str, type[LossModule]] = {
 }
 """Losses that a method's YAML can name."""
 FITS = {
-    "pairs": ("pairs",),
+    "pairs": ("pairs", "pairs in parts"),
     "sets": ("pairs", "sets"),
     "ranking": ("ranking",),
     "targets": ("targets",),
     "groups": ("groups",),
 }
-"""What a loss can read, by its ``sides``: pairs may be read as two sets."""
+"""What a loss can read, by its ``sides``: all pairs of a scene may be read as two sets."""
 
 
 def make_loss(section: DictConfig, model: MotionModel) -> LossModule:

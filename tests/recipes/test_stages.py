@@ -550,6 +550,7 @@ def test_the_loss_of_every_method_can_be_built_and_reads_its_data(method: str) -
         ("contrastive", "sets", "gives sets; say method.data.kind=pairs or adversarial or expert"),
         ("kahneman_tversky", "best", "gives targets; say method.data.kind=pairs or sets or adversarial or expert"),
         ("next_token", "pairs", "next_token learns from targets"),
+        ("kahneman_tversky", "own_pairs", "gives pairs in parts; say method.data.kind=pairs or sets"),
     ],
 )  # fmt: skip
 def test_a_loss_that_would_misread_the_data_is_refused(loss: str, data: str, message: str) -> None:

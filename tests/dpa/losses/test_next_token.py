@@ -100,6 +100,10 @@ def test_keys_can_be_set_to_nested_ones(network: tuple, logs: TensorDict) -> Non
     assert loss.in_keys == list(renamed.values())
     nested = TensorDict({key: logs[name] for name, key in renamed.items()}, batch_size=logs.batch_size)
     assert (loss(nested) == expected).all()
+    alone = NextTokenLoss(network[0])
+    alone.set_keys(**renamed)
+    assert alone.in_keys == loss.in_keys, "labels are the tokens themselves by default, wherever these lie"
+    assert (alone(nested) == expected).all()
     with pytest.raises(ValueError, match="targets"):
         loss.set_keys(targets="tokens")
 

@@ -6,6 +6,7 @@ import copy
 import os
 import signal
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from unittest import mock
@@ -22,6 +23,7 @@ from dpa.models.motionlm import MotionLM, featurize
 from dpa.ranking.transform import RankRollouts
 from dpa.rollout import RolloutCollector, Workers, make_collector
 from dpa.rollout.collector import agents_of
+from dpa.rollout.crew import _as_sent
 from dpa.rollout.plan import GIB, collected_bytes
 from dpa.rollout.ray_crew import RayCrew
 from dpa.tokens import TokenAction
@@ -167,6 +169,34 @@ def fail(scenes: object) -> Callable[[TensorDictBase], TensorDictBase]:
         raise ValueError("no such feature")
 
     return process
+
+
+def leave(scenes: object) -> Callable[[TensorDictBase], TensorDictBase]:
+    return lambda batch: os._exit(3)
+
+
+class Homeless(Exception):
+    def __init__(self, where: str, why: str) -> None:
+        super().__init__(f"{where}: {why}")
+
+
+def test_an_error_that_cannot_be_read_back_is_told_in_words() -> None:
+    sent = _as_sent(Homeless("scene 3", "no road"))
+    assert type(sent) is RuntimeError and str(sent) == "Homeless: scene 3: no road"
+    error = ValueError("as it is")
+    assert _as_sent(error) is error
+
+
+@pytest.mark.slow
+def test_a_worker_that_ends_by_itself_is_no_want_of_memory(collect: Callable) -> None:
+    with pytest.raises(ChildProcessError, match="ended with exit status 3 before it could answer; what it wrote says"):
+        collect(workers=Workers(1, "process"), make_postproc=leave)
+
+
+@pytest.mark.slow
+def test_a_worker_that_cannot_begin_says_why(collect: Callable) -> None:
+    with pytest.raises(Exception, match="(?i)nonsense|device"):
+        collect(workers=Workers(1, "process"), device="nonsense")
 
 
 @pytest.mark.slow
@@ -353,9 +383,50 @@ def test_a_collector_goes_forward_alone(stepwise: Callable) -> None:
             collector.load_state_dict(state)
 
 
-def test_unknown_weights_are_refused(stepwise: Callable) -> None:
+def test_unknown_weights_are_refused(stepwise: Callable, model: MotionLM) -> None:
     with pytest.raises(ValueError, match=r"weights \['wings'\] are none of the model's"):
         stepwise().update_policy_weights_({"wings": torch.zeros(1)})
+    larger = MotionLM(replace(model.config, width=32), model.tokenizer)
+    with pytest.raises(ValueError, match=r"are \[.*\], and the model's are \[.*\]; give those of a model of the same"):
+        stepwise().update_policy_weights_(larger)
+    with pytest.raises(ValueError, match="say one of policy_or_weights, weights and policy"):
+        stepwise().update_policy_weights_(larger, policy=larger)
+    with pytest.raises(TypeError, match="weights_dict"):
+        stepwise().update_policy_weights_(weights_dict={"policy": larger})
+
+
+@pytest.mark.parametrize("told", ["policy_or_weights", "weights", "policy"])
+def test_weights_are_taken_by_any_name_that_collectors_have_for_them(
+    stepwise: Callable, collect: Callable, model: MotionLM, told: str
+) -> None:
+    collector, weights, before = stepwise(), other_weights(model), collect()
+    other = copy.deepcopy(model)
+    other.load_state_dict(weights)
+    given = {"policy": other, "weights": TensorDict(weights).unflatten_keys("."), "policy_or_weights": weights}[told]
+    collector.update_policy_weights_(**{told: given})
+    driven = tokens_of(collector, 2)
+    model.load_state_dict(weights)
+    assert_same(driven, collect())
+    assert any(not torch.equal(driven[scene], before[scene]) for scene in before)
+
+
+def test_hooks_of_a_collector_see_each_batch(stepwise: Callable) -> None:
+    collector, seen = stepwise(), []
+    collector.pre_collect_hook = lambda: seen.append("before")
+    collector.post_collect_hook = lambda batch: seen.append(batch)
+    for batch in collector:
+        assert seen == ["before", batch] or all(a is b for a, b in zip(seen, ["before", batch], strict=True))
+        seen.clear()
+
+
+def test_episodes_longer_than_the_policy_knows_are_refused(model: MotionLM, scenes: list[Scene]) -> None:
+    short = MotionLM(replace(model.config, horizon=8), model.tokenizer)
+    with pytest.raises(
+        ValueError, match="episodes of 16 decisions need a policy .* has horizon=8; give EpisodeOptions"
+    ):
+        make_collector(scenes, short, num_rollouts=2)
+    batch = next(iter(make_collector(scenes, short, num_rollouts=2, options=EpisodeOptions(horizon=8))))
+    assert batch.batch_size[1] == 8
 
 
 def test_it_is_a_collector_of_torchrl(stepwise: Callable) -> None:
@@ -416,6 +487,8 @@ def test_a_ray_worker_that_is_lost_is_replaced_and_one_that_cannot_start_says_wh
     crew = object.__new__(RayCrew)
     crew._ray = mock.Mock(exceptions=_Errors, wait=lambda running, **_: (running, []), get=mock.Mock(side_effect=error))
     crew._running, crew._hands, crew._start = {"task": 0}, ["lost"], lambda: "new"
+    crew._told, crew._tell = ["of the lost"], lambda hand: f"of the {hand}"
     worker, outcome = crew.wait()
     assert (worker, outcome.batch, crew._hands) == (0, None, ["lost" if told else "new"])
+    assert crew._told == ["of the lost" if told else "of the new"], "the new one hears of the weights"
     assert str(outcome.error) == str(told)
