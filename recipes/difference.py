@@ -72,6 +72,9 @@ def differences(side: Side, other: Side, evaluations: Evaluations, at: Sequence[
             values that is not there, or values of other scenes.
     """
     both = (side, other)
+    if side.experiment.split != other.experiment.split:
+        told = " and ".join(f"{experiment.name} on {experiment.reported}" for experiment, _ in both)
+        raise ValueError(f"scenes are paired, and these are others: {told}; compare methods of one of the two.")
     own = tuple(experiment.chosen.get(method) for experiment, method in both)
     decodings = {0: own, 1: (*at, *at), 2: at}[len(at)]
     evaluated = [_rows(*each, decoding) for each, decoding in zip(both, decodings, strict=True)]

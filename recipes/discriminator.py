@@ -26,6 +26,7 @@ from dpa.tokens import MotionTokenizer
 from dpa.training.checkpoint import load_policy, load_weights, save_policy
 from envs.episode import EpisodeOptions
 from envs.files import write_json
+from envs.locks import alone_in
 from envs.progress import progress
 from envs.store import SceneStore
 from recipes.common.cli import CONFIG, build, finished, finite, plain, study_recipe
@@ -74,20 +75,22 @@ def trained(cfg: DictConfig, scenes: SceneStore, policy: Path, name: str) -> tup
         "decoding": plain(cfg.decoding),
         "seed": cfg.seed,
     }
-    done = finished(result, decided_by)
-    if done is not None and weights.is_file():
-        net = Discriminator(**shape)
-        load_weights(net, *load_policy(weights)[:2], shape, where=str(weights))
-        return net.eval(), done
     rolled_by = {key: decided_by[key] for key in ("policy", "scenes", "sight", "decoding", "seed")}
-    shelf = MotionShelf(folder / "motions", rolled_by | {"num_rollouts": cfg.training.num_rollouts})
-    there = frozenset(shelf.scenes())
-    see = partial(seen, sight=sight, tokenizer=model.tokenizer.on_cpu(), options=episode)
-    rolling = OmegaConf.merge(cfg, {"num_rollouts": cfg.training.num_rollouts})
-    with progress(total=len(scenes), description=f"{name} rollouts", initial=len(there), unit="scene") as bar:
-        for each in driven(scenes, model, episode, rolling, there):
-            shelf.put(each.index, see(each)[0])
-            bar.update()
+    with alone_in(folder):
+        shelf = MotionShelf(folder / "motions", rolled_by | {"num_rollouts": cfg.training.num_rollouts})
+        done = finished(result, decided_by)
+        if done is not None and weights.is_file():
+            shelf.remove()  # where a command was killed at its end
+            net = Discriminator(**shape)
+            load_weights(net, *load_policy(weights)[:2], shape, where=str(weights))
+            return net.eval(), done
+        there = frozenset(shelf.scenes())
+        see = partial(seen, sight=sight, tokenizer=model.tokenizer.on_cpu(), options=episode)
+        rolling = OmegaConf.merge(cfg, {"num_rollouts": cfg.training.num_rollouts})
+        with progress(total=len(scenes), description=f"{name} rollouts", initial=len(there), unit="scene") as bar:
+            for each in driven(scenes, model, episode, rolling, there):
+                shelf.put(each.index, see(each)[0])
+                bar.update()
     net, curve = fit(cfg.training, shape, shelf, folder, seed=cfg.seed, decided_by=decided_by, logger=cfg.logger)
     save_policy(weights, net.state_dict(), shape, {"seed": cfg.seed})
     done = {"options": decided_by, "scenes": len(scenes), "best": best_look(curve), "curve": curve}

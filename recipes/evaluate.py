@@ -89,6 +89,8 @@ def evaluate(
         "seed": seed,
     }
     done = finished(path, decided_by)
+    if done is not None and not set(FIGURES) <= done["per_scene"].keys():
+        done = None  # of an earlier version, which had fewer figures
     submission = None if open_submission is None else open_submission(scenes.scene_ids, decided_by)
     if done is not None and (submission is None or submission.finished):
         return done

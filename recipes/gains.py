@@ -13,6 +13,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import hydra
 from numpy.typing import NDArray
@@ -76,25 +77,27 @@ def less(found: Sequence[tuple[Path, Experiment]], methods: Sequence[str]) -> di
         methods: whose gains, in order.
 
     Returns:
-        By the name of the folder; None where a gain is not known in every scene, or is of other scenes.
+        By the name of the folder; None where a gain is not known in every scene, or is of other scenes (whatever they
+        are called), another number of rollouts or another metric.
     """
 
-    def gains(folder: Path, comparison: Comparison) -> tuple[list[str], list[NDArray | None]]:
-        """Names of the scenes, and of each method its gain ``[seeds, scenes]``."""
+    def gains(folder: Path, comparison: Comparison) -> tuple[dict[str, Any], list[NDArray | None]]:
+        """Scenes, rollouts and metric, and of each method its gain ``[seeds, scenes]``."""
         evaluations, base = Evaluations(folder), comparison.base()
         rows = [comparison.of(method, decoding_of(comparison.entry(method))) for method in methods]
         both = [paired_values(mine, base, "realism", evaluations) for mine in rows]
-        scenes = read_json(folder / base[0]["file"]).get("scenes", [])
-        known = [values is not None and values.shape[-1] == len(scenes) for values in both]
-        return scenes, [each[0] - each[1] if told else None for each, told in zip(both, known, strict=True)]
+        result = read_json(folder / base[0]["file"])
+        known = [values is not None and values.shape[-1] == len(result["scenes"]) for values in both]
+        measured = {name: result["options"][name] for name in ("scenes", "evaluation")}
+        return measured, [each[0] - each[1] if told else None for each, told in zip(both, known, strict=True)]
 
-    (named, first), *others = (gains(folder, experiment.own_best) for folder, experiment in found)
+    (alike, first), *others = (gains(folder, experiment.own_best) for folder, experiment in found)
     return {
         folder.name: [
-            None if scenes != named or mine is None or base is None else unpaired_bootstrap(mine, base)
+            None if measured != alike or mine is None or base is None else unpaired_bootstrap(mine, base)
             for mine, base in zip(other, first, strict=True)
         ]
-        for (folder, _), (scenes, other) in zip(found[1:], others, strict=True)
+        for (folder, _), (measured, other) in zip(found[1:], others, strict=True)
     }
 
 
@@ -136,6 +139,11 @@ def main(cfg: DictConfig) -> None:
         raise ValueError(f"runs={list(cfg.runs)} and methods={methods} must name one or more each.")
     names = names_of(cfg.name, cfg.runs)
     found = [(Path(runs), read(Path(runs), name, methods)) for runs, name in zip(cfg.runs, names, strict=True)]
+    if len(metrics := {experiment.metric: folder for folder, experiment in found}) > 1:
+        told = ", ".join(f"{folder} of {metric}" for metric, folder in metrics.items())
+        raise ValueError(
+            f"gains are told by one metric, and here realism is {told}; leave the runs of one of them out."
+        )
     labels = {method: found[0][1].labels[method] for method in methods}
     rows: dict[str, list[Cell]] = {}
     competence, gains = {}, {label: {} for label in labels.values()}

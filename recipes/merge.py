@@ -30,6 +30,7 @@ from dpa.report.experiment import Experiment, decoding_of, read_experiment, read
 from dpa.report.table import REFERENCE
 from envs.files import write_json
 from envs.options import differences
+from recipes.alignment.inputs import OBSERVING
 from recipes.common.cli import refused
 from recipes.common.provenance import provenance
 from recipes.compare import adopt_policies, made_by, measure, train_policies
@@ -44,9 +45,9 @@ METHODS = ("methods", "rankings", "experiment.setup", "experiment.labels", "expe
 """Options by method or by ranking: parts agree in those that they share."""
 APART = (
     "seeds", "reference", "trained", "output", "only", "scenes", "threads", "workers", "device", "logger", "pictures",
-    "decoding.grid", "decoding.chosen", "alignment.snapshots", "alignment.workers", "alignment.memory",
-    "alignment.max_rows", "alignment.checkpoint_interval", "collection.workers", "collection.memory",
-    "collection.compile", "collection.chunk_scenes", "evaluation.memory",
+    "decoding.grid", "decoding.chosen", *(f"alignment.{name}" for name in OBSERVING),
+    "collection.workers", "collection.memory", "collection.compile", "collection.chunk_scenes",
+    "collection.ranking.threads", "evaluation.memory",
     "experiment.name", "experiment.title", "experiment.question", "experiment.paper", "experiment.headline",
     "experiment.versus", "experiment.axis",
 )  # fmt: skip
@@ -281,7 +282,8 @@ def _gather(parts: Sequence[Part], runs: RunFolder) -> None:
             kept, signed = account.setdefault(stage, {}), origins["jobs"].setdefault(stage, {})
             for job in jobs.keys() - kept.keys():
                 kept[job] = jobs[job]
-                signed[job] = origins["made"].index(theirs["made"][theirs["jobs"][stage][job]])
+                if (place := theirs["jobs"].get(stage, {}).get(job)) is not None:
+                    signed[job] = origins["made"].index(theirs["made"][place])
     shutil.copyfile(parts[0].runs.scenes, runs.scenes)
     write_json(runs.stages, account)
     write_json(origins_beside(runs.stages), origins)

@@ -54,7 +54,8 @@ from recipes.common.provenance import provenance
 from recipes.common.scenes import Splits, fingerprint, open_splits
 
 OBSERVING = ("checkpoint_interval", "max_rows", "workers", "keep_gib", "start")
-"""Options of the section ``pretraining`` that change nothing about the policy; of its start, the weights count."""
+"""Options of the section ``pretraining`` that change nothing about the policy, but what dropout and an auxiliary loss
+draw in a pass; of its start, the weights count."""
 
 
 def pretrain(

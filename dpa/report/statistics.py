@@ -7,7 +7,7 @@ were sampled: the training runs (seeds) and the scenes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -188,66 +188,6 @@ def resampled_means(values: ArrayLike, num_resamples: int = 10_000, *, seed: int
 def _means(values: NDArray[np.float64], seeds: NDArray, scenes: NDArray) -> NDArray[np.float64]:
     """Of ``[seeds, scenes]`` in every resample: drawing rows and columns is weighting them by their counts."""
     return np.einsum("rk,kn,rn->r", seeds, values, scenes, optimize=True) / values.size
-
-
-def compare_methods(
-    per_scene: Mapping[str, Mapping[str, Sequence[float]]],
-    reference: str,
-    num_resamples: int = 10_000,
-) -> list[dict]:
-    """The ``paired`` entries of a comparison: every method against the reference.
-
-    Args:
-        per_scene: ``{method: {seed: realism of each evaluation scene}}``, all methods with the same scenes in the same
-            order. A method's seeds are paired with the reference's seeds of the same name, or all with its only seed.
-        reference: name of the reference method.
-        num_resamples: bootstrap draws.
-
-    Returns:
-        ``{"method", "realism_difference", "ci95": [low, high], "over", "n_seeds"}`` for each method, in order.
-
-    Raises:
-        ValueError: the reference is missing, or seeds or scenes do not pair; the message names the method.
-
-    Examples:
-        >>> scores = {"reference": {"0": [0.6, 0.7]}, "DPA-OMF": {"0": [0.7, 0.8], "1": [0.7, 0.8]}}
-        >>> entry = compare_methods(scores, "reference", num_resamples=100)[0]
-        >>> entry["method"], round(entry["realism_difference"], 3), entry["over"]
-        ('DPA-OMF', 0.1, 'seeds and scenes')
-    """
-    if reference not in per_scene:
-        raise ValueError(f"no method {reference!r} to compare with; per_scene has {sorted(per_scene)}.")
-    base, entries = per_scene[reference], []
-    for method, runs in per_scene.items():
-        if method == reference:
-            continue
-        if len(base) > 1 and not set(runs) <= set(base):
-            raise ValueError(
-                f"{method}: seeds {sorted(set(runs) - set(base))} have no run of {reference!r} to be paired with; it "
-                f"has {sorted(base)}. Give it one run for all, or the same seeds."
-            )
-        paired = [base[run] for run in runs] if len(base) > 1 else list(base.values())
-        try:
-            found = paired_bootstrap(_rows(runs.values()), _rows(paired), num_resamples)
-        except ValueError as error:
-            raise ValueError(f"{method} against {reference}: {error}") from error
-        entries.append(
-            {
-                "method": method,
-                "realism_difference": found.mean,
-                "ci95": [found.low, found.high],
-                "over": found.over,
-                "n_seeds": found.num_seeds,
-            }
-        )
-    return entries
-
-
-def _rows(runs: Sequence[Sequence[float]]) -> NDArray[np.float64]:
-    lengths = [len(run) for run in runs]
-    if len(set(lengths)) > 1:
-        raise ValueError(f"the seeds have different numbers of scenes, {lengths}.")
-    return np.array([list(run) for run in runs], dtype=np.float64)
 
 
 def _checked(values: ArrayLike, name: str) -> NDArray[np.float64]:

@@ -54,7 +54,9 @@ def _experiment(experiment: Experiment, evaluations: Evaluations) -> Iterator[st
     yield headline(experiment)
     compared = experiment.comparisons()
     if "own best" in compared:
-        yield f"**Each at its own best decoding**, chosen on the {experiment.scenes['tune']} tuning scenes:"
+        chosen = experiment.config.get("decoding", {}).get("chosen")
+        by = f"as {chosen} chose" if chosen else f"chosen on the {experiment.scenes['tune']} tuning scenes"
+        yield f"**Each at its own best decoding**, {by}:"
     else:
         yield f"**All at {next(iter(compared))}**, the one decoding of this experiment:"
     yield comparison_table(experiment, experiment.own_best)

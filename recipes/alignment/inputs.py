@@ -15,11 +15,11 @@ from envs.episode import EpisodeOptions
 from envs.progress import message
 from envs.store import SceneStore
 from recipes.alignment.candidates import Candidates, make_candidates
-from recipes.alignment.data import ROLLED, SIDES
+from recipes.alignment.data import ON_POLICY, ROLLED, SIDES, rewards_of
 from recipes.alignment.watch import ImitationLook, Look, Watch
 from recipes.common.cli import deciding, plain
 from recipes.common.models import open_policy, weights_digest
-from recipes.common.rankings import open_preferences
+from recipes.common.rankings import build_distance, open_preferences
 from recipes.common.scenes import fingerprint
 
 OBSERVING = (
@@ -99,9 +99,13 @@ class Inputs:
             alignment: the section.
             seed: of batches.
         """
-        says_nothing = ("pairs_per_scene",) if method.data.kind in ROLLED else ("staleness",)
+        kind, data = method.data.kind, plain(method.data)
+        says_nothing = (*("pairs_per_scene",) * (kind in ON_POLICY), *("staleness",) * (kind not in ROLLED))
+        if kind in ROLLED:  # of a metric in a file its content; rewards that weigh nothing and threads change nothing
+            data["ranking"] = build_distance(method.data.ranking, "method.data.ranking").describe()
+            data |= {"rewards": rewards_of(method.data)} if "rewards" in data else {}
         return {
-            "data": plain(method.data),
+            "data": data,
             "loss": plain(method.loss),
             "alignment": deciding(alignment, *OBSERVING, *says_nothing),
             "scenes": fingerprint(self.scenes.subset(self.learnt)),

@@ -76,7 +76,7 @@ LIMITS: dict[str, Limit] = {
     "has_lights": FLAG._replace(empty=True),
     "rankings_per_scene": Limit(float, empty=True),
     **dict.fromkeys(("collection.workers", "alignment.workers"), Limit(dict)),
-    "seeds": Limit(int, many=True),
+    "seeds": Limit(int, least=0, most=2**32 - 1, many=True),
     "snapshots": COUNT._replace(many=True),
 }
 """Limit of an option by its last name, or by its last two where one name has several meanings."""
@@ -84,7 +84,7 @@ OWN = ("model.context", "model.tokenizer")
 """Sections whose options are those of a class, of the user's own perhaps: :mod:`recipes.common.kinds` judges them."""
 CLOSED = (
     *("", "pretraining", "collection", "alignment", "evaluation", "decoding", "pictures", "experiment", "logger"),
-    *("training", "method", "model", "scenes"),
+    *("training", "method", "model", "scenes", "vocabulary"),
 )
 """Sections whose options all stand in their YAML; ``""`` is the recipe itself."""
 GROUPS = Path(__file__).parents[1] / "config"
@@ -152,7 +152,14 @@ def check_added(overrides: Iterable[str], cfg: DictConfig) -> None:
         Traceback (most recent call last):
         ...
         ValueError: alignment has no option 'step'; it takes steps, lr.
+        >>> check_added(["+vocabulary.radious=1"], OmegaConf.create({"vocabulary": {"radius": 2, "radious": 1}}))
+        Traceback (most recent call last):
+        ...
+        ValueError: vocabulary has no option 'radious'; it takes radius.
     """
+    if twice := next((override for override in overrides if override.startswith("++")), None):
+        key = twice.lstrip("+").partition("=")[0]
+        raise ValueError(f"{twice}: say {key}=... of an option that is there, and +{key}=... of a new one.")
     added = {override.lstrip("+").partition("=")[0] for override in overrides if override.startswith("+")}
     for key in sorted(added):
         section, _, option = key.rpartition(".")
@@ -202,4 +209,4 @@ def _misfit(value: Any, limit: Limit) -> str | None:
         return f"above {limit.least:g}"
     if limit.least <= value <= limit.most:
         return None
-    return f"{limit.least:g} or more" if limit.most == math.inf else f"from {limit.least:g} to {limit.most:g}"
+    return f"{limit.least:g} or more" if limit.most == math.inf else f"from {limit.least:g} to {limit.most:.10g}"

@@ -17,9 +17,11 @@ from dpa.realism.config import RealismConfig
 from dpa.realism.tracks import HORIZON
 from dpa.report.experiment import REPORTED, read_experiment
 from dpa.report.table import REFERENCE
+from dpa.rollout.collector import rows_within
 from envs.episode import EpisodeOptions
 from envs.options import differences
 from recipes.alignment.data import ROLLED, check_data
+from recipes.alignment.inputs import OBSERVING
 from recipes.alignment.losses import check_fit, make_loss
 from recipes.alignment.on_policy import check_workers
 from recipes.collect import check_collection
@@ -27,9 +29,17 @@ from recipes.common.cli import check_steps, plain, told_of
 from recipes.common.limits import GROUPS, check_limits, is_number
 from recipes.common.models import build_policy
 from recipes.common.rankings import build_distance, ranking_options
-from recipes.experiment.jobs import check_made_alike, chosen_by, compared_policy, reference_of, trained_in
+from recipes.experiment.jobs import (
+    check_made_alike,
+    chosen_by,
+    compared_policy,
+    named_reference,
+    reference_of,
+    trained_in,
+)
 from recipes.experiment.methods import checkpoints_of, policies_of, read_setups
 from recipes.experiment.summary import chosen_in, labels
+from recipes.pretrain import Origin, auxiliary_of
 
 CHECKPOINTS = ("last", "select", "all")
 """What becomes of the snapshots of an alignment: there are none, one of them may be chosen, or each is shown."""
@@ -37,8 +47,6 @@ OWN = ("run/default.yaml", "comparison.yaml", "experiment/base.yaml")
 """Where the options stand that an experiment has beside its :data:`SECTIONS`."""
 SECTIONS = ("logger", "pretraining", "collection", "alignment", "evaluation")
 AXIS = ("name", "values", "log")
-OF_THE_MACHINE = ("workers", "memory", "max_rows", "checkpoint_interval")
-"""Options of an alignment that change no policy, but for rounding."""
 
 
 def check_experiment(cfg: DictConfig) -> None:
@@ -87,14 +95,18 @@ def _check_references(cfg: DictConfig) -> None:
     each = cfg.reference if OmegaConf.is_list(cfg.reference) else [cfg.reference]
     if cfg.reference is not None and not all(isinstance(name, str) for name in each):
         raise ValueError(f"reference must be a file or zoo:NAME, a list of them, or null, got {cfg.reference!r}.")
+    _check_number(cfg)
+    if cfg.reference is not None:
+        for seed in cfg.seeds:
+            reference_of(cfg, seed)
+
+
+def _check_number(cfg: DictConfig) -> None:
     if OmegaConf.is_list(cfg.reference) and len(cfg.reference) != len(cfg.seeds):
         raise ValueError(
             f"reference has {len(cfg.reference)} policies for the {len(cfg.seeds)} seeds {list(cfg.seeds)}; name one "
             "for each, or one for all of them."
         )
-    if cfg.reference is not None:
-        for seed in cfg.seeds:
-            reference_of(cfg, seed)
 
 
 def _check_trained(cfg: DictConfig) -> None:
@@ -109,6 +121,13 @@ def _check_trained(cfg: DictConfig) -> None:
     theirs, mine = read_experiment(runs.experiment(name)).config, plain(cfg)
     if origin := theirs.get("trained"):
         raise ValueError(f"trained={cfg.trained} has its policies from {origin}; say trained={origin}.")
+    _check_number(cfg)
+    for seed in set(cfg.seeds) & set(theirs["seeds"]):
+        if (named := named_reference(cfg, seed)) != (other := named_reference(OmegaConf.create(theirs), seed)):
+            raise ValueError(
+                f"trained={cfg.trained} has aligned reference={other} of seed {seed}, and here it is {named}; give the "
+                "same seeds and references here."
+            )
     if differ := differences(_of_training(theirs, mine["methods"]), _of_training(mine, mine["methods"])):
         raise ValueError(f"trained={cfg.trained} was trained with other options than are told here: {differ}.")
     needed = (runs.policy(seed, policy) for seed in cfg.seeds for policy in policies_of(cfg))
@@ -120,8 +139,11 @@ def _check_trained(cfg: DictConfig) -> None:
 def _of_training(config: Mapping[str, Any], methods: Iterable[str]) -> dict[str, Any]:
     """What decides the aligned policies of some methods, beside their references and scenes."""
     given = {name: config[name] for name in ("rankings", "aligned_scenes")}
-    given["alignment"] = {key: value for key, value in config["alignment"].items() if key not in OF_THE_MACHINE}
-    given["collection"] = {key: config["collection"][key] for key in ("num_rollouts", "decoding", "ranking")}
+    given["alignment"] = {key: value for key, value in config["alignment"].items() if key not in OBSERVING}
+    given["collection"] = {key: config["collection"][key] for key in ("num_rollouts", "decoding")}
+    given["collection"]["ranking"] = {
+        key: value for key, value in config["collection"]["ranking"].items() if key != "threads"
+    }
     given["methods"] = {name: config["methods"].get(name) for name in methods}
     given["setup"] = {name: config["experiment"]["setup"].get(name) for name in methods}
     return given
@@ -205,6 +227,15 @@ def _check_methods(cfg: DictConfig, policy: dict[str, Any]) -> None:
             f"horizon={HORIZON // policy['episode']['decision_steps']}, or take other references."
         )
     model.distribution.check_smoothing(cfg.pretraining.label_smoothing)
+    for section in ("collection", "evaluation"):
+        with told_of(section):
+            rows_within(cfg[section].memory, model)
+    if cfg.collection.compile and not model.compiles:
+        raise ValueError(f"{type(model).__name__} compiles nothing; say collection.compile=false.")
+    if cfg.reference is None and cfg.trained is None:
+        auxiliary_of(model, cfg.pretraining.auxiliary)
+        if cfg.pretraining.start is not None:
+            Origin.open(cfg.pretraining.start).load_into(model, policy)
     for name, setup in read_setups(cfg).items():
         if unknown := sorted(set(cfg.methods[name]) - {"name", "data", "loss"}):
             raise ValueError(

@@ -60,9 +60,9 @@ def compared_policy(cfg: DictConfig) -> dict[str, Any]:
     return open_policy(named_reference(cfg, cfg.seeds[0]))[2]
 
 
-def named_reference(cfg: DictConfig, seed: int) -> str:
-    """The reference that the options name for a seed."""
-    return cfg.reference if isinstance(cfg.reference, str) else cfg.reference[list(cfg.seeds).index(seed)]
+def named_reference(cfg: DictConfig, seed: int) -> str | None:
+    """The reference that the options name for a seed; None where they name none."""
+    return cfg.reference[list(cfg.seeds).index(seed)] if OmegaConf.is_list(cfg.reference) else cfg.reference
 
 
 def reference_of(cfg: DictConfig, seed: int) -> Path:

@@ -8,11 +8,13 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
 from omegaconf import DictConfig
 
 from dpa.models import Decoding
 from dpa.report.experiment import Experiment, decoding_of, read_json
-from dpa.report.statistics import compare_methods
+from dpa.report.statistics import paired_bootstrap
 from dpa.report.table import REFERENCE
 from recipes.alignment.data import ON_POLICY, RANKED, ROLLED, num_candidates
 from recipes.alignment.draws import num_drawn
@@ -120,25 +122,26 @@ class Results:
 
     def paired(self, shown: Sequence[Shown], reference: Shown) -> list[dict[str, Any]]:
         """Realism of each run minus that of a reference, by scene and seed, with intervals."""
-        if not shown:
-            return []
-        scores = {
-            str(number): {str(seed): self._known(self._scores(run, seed)) for seed in self.seeds}
-            for number, (_, run) in enumerate([reference, *shown])
-        }
         against = reference[1].decoding
-        return [
-            entry
-            | {
-                "method": method,
-                "top_p": run.decoding.top_p,
-                "temperature": run.decoding.temperature,
-                "against": reference[0],
-                "against_top_p": against.top_p,
-                "against_temperature": against.temperature,
-            }
-            for (method, run), entry in zip(shown, compare_methods(scores, "0"), strict=True)
-        ]
+        base = self._known_scores(reference[1])
+        entries = []
+        for method, run in shown:
+            found = paired_bootstrap(self._known_scores(run), base)
+            entries.append(
+                {
+                    "method": method,
+                    "realism_difference": found.mean,
+                    "ci95": [found.low, found.high],
+                    "over": found.over,
+                    "n_seeds": found.num_seeds,
+                    "top_p": run.decoding.top_p,
+                    "temperature": run.decoding.temperature,
+                    "against": reference[0],
+                    "against_top_p": against.top_p,
+                    "against_temperature": against.temperature,
+                }
+            )
+        return entries
 
     def _row(self, method: str, run: Run, seed: int, split: str) -> dict[str, Any]:
         path = self.runs.evaluation(seed, run, split)
@@ -158,6 +161,10 @@ class Results:
 
     def _known(self, values: Sequence[float | None]) -> list[float | None]:
         return list(compress(values, self.known))
+
+    def _known_scores(self, run: Run) -> NDArray[np.float64]:
+        """``[seeds, scenes]``, of scenes where every run has realism."""
+        return np.array([self._known(self._scores(run, seed)) for seed in self.seeds], dtype=np.float64)
 
     def _scores(self, run: Run, seed: int) -> list[float | None]:
         return read_json(self.runs.evaluation(seed, run, self.split))["per_scene"]["realism"]

@@ -222,7 +222,15 @@ def test_a_folder_is_taken_over_whole_once_and_not_trained_on(
         (["seeds=[0,7]"], "seed_7/reference/policy.pt does not exist; finish the experiment there"),
         (["alignment.lr=0.5"], "was trained with other options than are told here: 'alignment.lr'"),
         (["collection.num_rollouts=6"], "'collection.num_rollouts': 4 there, 6 here"),
-        (["alignment.snapshots=[3]"], r"'alignment.snapshots': \[2\] there, \[3\] here"),
+        (["alignment.snapshots=[3]"], "step_3/policy.pt does not exist; finish the experiment there"),
+        (
+            ["alignment.watch_interval=3", "collection.ranking.threads=2", "alignment.lr=0.5"],
+            "here: 'alignment.lr': [^,]*$",
+        ),
+        (
+            ["reference=zoo:motionlm-nano-sumo"],
+            "has aligned reference=None of seed 0, and here it is zoo:motionlm-nano",
+        ),
         (["+experiment.setup.dpa_omf={length:2}"], "'setup.dpa_omf': None there"),
     ],
 )

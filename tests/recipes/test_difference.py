@@ -15,7 +15,7 @@ from dpa.report.statistics import paired_bootstrap
 from dpa.report.study import Evaluations
 from recipes import difference
 from recipes.difference import Difference, Side, differences, differences_of_files, differences_to_rung
-from tests.dpa.report.runs import BEST, COMMON, SEEDS, likelihoods, values, write_runs
+from tests.dpa.report.runs import BEST, COMMON, SEEDS, likelihoods, values, write_experiment, write_runs
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +43,17 @@ def test_each_method_stands_at_its_own_best_decoding(runs: Path) -> None:
     assert realism.interval == paired_bootstrap(mine, base)
     assert (realism.mine, realism.other) == pytest.approx((mine.mean(), base.mean()))
     assert realism.ahead == (mine.mean(1) > base.mean(1)).sum()
+
+
+def test_tuning_scenes_are_not_paired_with_evaluation_scenes(tmp_path: Path) -> None:
+    runs = write_runs(tmp_path)
+    write_experiment(runs, "budgets", ["reference", "dpa_omf"], split="tune")
+    two = (read_experiment(runs / "experiments" / f"{name}.json") for name in ("methods", "budgets"))
+    sides = [Side(experiment, "dpa_omf") for experiment in two]
+    with pytest.raises(
+        ValueError, match="methods on .* evaluation scenes and budgets on .* tuning scenes; compare methods"
+    ):
+        list(differences(*sides, Evaluations(runs)))
 
 
 def test_decodings_may_be_given_for_both_or_one_of_each(runs: Path) -> None:

@@ -63,21 +63,33 @@ def test_gains_stand_beside_those_of_the_first_where_the_scenes_are_the_same(
         values = json.loads((better / file).read_text())
         values["per_scene"]["realism"] = [each + 0.125 for each in values["per_scene"]["realism"]]
         (better / file).write_text(json.dumps(values))
-    elsewhere = tmp_path / "elsewhere"
-    shutil.copytree(studies[0], elsewhere)
-    for file in elsewhere.rglob("*.json"):
-        values = json.loads(file.read_text())
-        if "scenes" in values and "per_scene" in values:
-            file.write_text(json.dumps(values | {"scenes": [f"{name}, of another town" for name in values["scenes"]]}))
-    outcome = run("gains", *told([studies[0], better, elsewhere], tmp_path / "out"))
+    elsewhere, fewer = tmp_path / "elsewhere", tmp_path / "fewer"
+    for folder, options in ((elsewhere, {"scenes": "of another town"}), (fewer, {"evaluation": {"num_rollouts": 16}})):
+        shutil.copytree(studies[0], folder)
+        for file in folder.rglob("eval_*.json"):
+            values = json.loads(file.read_text())
+            file.write_text(json.dumps(values | {"options": values["options"] | options}))
+    outcome = run("gains", *told([studies[0], better, elsewhere, fewer], tmp_path / "out"))
     assert outcome.status == 0, outcome.err
     (table,) = (tmp_path / "out/tables/gains_minus_first").rglob("*.csv")
     rows = {row["runs"]: row for row in csv.DictReader(table.read_text(encoding="utf-8").splitlines())}
-    assert rows.keys() == {"better", "elsewhere"}
+    assert rows.keys() == {"better", "elsewhere", "fewer"}
     gained = [float(rows["better"][f"gain of DPA-OMF{end}"]) for end in ("", " low", " high")]
     assert gained[0] == pytest.approx(0.125) and gained[1] <= 0.125 <= gained[2]
     assert float(rows["better"]["gain of adversarial AFD"]) == pytest.approx(0)
-    assert rows["elsewhere"]["gain of DPA-OMF"] == "", "nothing can be said across scenes"
+    assert rows["elsewhere"]["gain of DPA-OMF"] == "", (
+        "nothing can be said across scenes, even if they are called alike"
+    )
+    assert rows["fewer"]["gain of DPA-OMF"] == "", "nor across numbers of rollouts"
+
+
+def test_gains_by_two_metrics_are_refused(run: Callable, studies: list[Path], tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(studies[0], other)
+    path = other / "experiments/methods.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"metric": "2025"}))
+    outcome = run("gains", *told([studies[0], other], tmp_path / "out"))
+    assert outcome.status == 2 and "first of 2024" in outcome.err and "other of 2025" in outcome.err
 
 
 def test_an_archive_tells_family_tokens_and_size_of_a_reference_of_the_zoo(run: Callable, tmp_path: Path) -> None:

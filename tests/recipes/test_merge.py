@@ -144,6 +144,8 @@ def test_machines_may_have_worked_and_logged_otherwise(parts: list[Path], tmp_pa
     def elsewhere(found: dict[str, Any]) -> None:
         found["config"]["collection"]["workers"] |= {"count": 8, "backend": "process"}
         found["config"]["logger"] |= {"backend": "wandb", "mode": "online"}
+        found["config"]["alignment"] |= {"watch_interval": 7}
+        found["config"]["collection"]["ranking"] |= {"threads": 4}
 
     def ranked_while_collecting(account: dict[str, dict[str, float]]) -> None:
         account["rank"] = {job: value for job, value in account["rank"].items() if not job.startswith("collect")}
@@ -152,6 +154,7 @@ def test_machines_may_have_worked_and_logged_otherwise(parts: list[Path], tmp_pa
     first = edit(tmp_path / "first", "experiments/families.json", elsewhere)
     edit(first, "stages.json", ranked_while_collecting)
     edit(first, "origins.json", lambda origins: ranked_while_collecting(origins["jobs"]))
+    edit(first, "origins.json", lambda origins: origins["jobs"]["align"].popitem())  # nobody knows what made it
     merge(tmp_path / "all", [first, *parts[1:]])
     found = content(tmp_path / "all")
     assert found["config"]["logger"] == {"backend": "csv", "mode": "offline"}

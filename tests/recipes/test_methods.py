@@ -290,11 +290,23 @@ def test_a_method_comes_after_those_that_it_starts_from_or_learns_from() -> None
             ("+rankings.mine=displacement",),
             r"rankings\.mine must be a section of options, got 'displacement'",
         ),
+        (("model=smart_nano", "collection.compile=true"), r"SMART compiles nothing; say collection\.compile=false"),
+        (("evaluation.memory=1e-9",), r"evaluation: memory must hold at least one agent, got 1e-09 GiB"),
+        (
+            ("pretraining.auxiliary=1.0",),
+            r"MotionLM has no auxiliary loss, and pretraining\.auxiliary=1\.0 asks for one",
+        ),
+        (("seeds=[-1]",), "seeds must be from 0 to 4294967295, got -1"),
     ],
 )
 def test_an_experiment_that_cannot_work_is_refused_before_any_work(options: tuple[str, ...], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         check_experiment(configuration(*options))
+
+
+def test_a_start_that_is_not_there_is_told_before_any_work() -> None:
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.pt does not exist; give the path of a saved policy"):
+        check_experiment(configuration("pretraining.start=nowhere.pt"))
 
 
 @pytest.mark.parametrize("config", ["demo", pytest.param("driving", marks=pytest.mark.slow)])

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from dpa.realism.config import FOLDER
+from dpa.rewards.functions import judge
 from dpa.training.checkpoint import load_policy
 from dpa.training.loggers import read_curve
 from recipes.alignment.on_policy import tasks_of
@@ -97,6 +99,25 @@ def test_pairs_of_its_own_may_be_any(
     outcome = run("align", *aligning(options, origin, "dpa_omf_on_policy", tmp_path, "alignment.steps=2", *more))
     assert outcome.status == 0, outcome.err
     assert len(read_curve(tmp_path, "train/loss_preference")) == 2
+
+
+def test_what_decides_nothing_is_no_other_run_and_the_content_of_a_metric_is(
+    run: Callable, options: Callable, origin: Path, tmp_path: Path
+) -> None:
+    steps = "alignment.steps=2"
+    rloo = aligning(options, origin, "rloo", tmp_path / "rloo", steps)
+    assert run("align", *rloo).status == 0
+    same = ("method.data.ranking.threads=2", "alignment.pairs_per_scene=3")
+    assert run("align", *rloo, *same).status == 0, "read back"
+    ours, mine = FOLDER / "2024.yaml", tmp_path / "mine.yaml"
+    mine.write_text(ours.read_text())
+    ranked = (steps, "ranking@method.data.ranking=realism", f"method.data.ranking.metric={mine}")
+    pairs = aligning(options, origin, "dpa_omf_on_policy", tmp_path / "pairs", *ranked)
+    assert run("align", *pairs).status == run("align", *pairs).status == 0
+    mine.write_text(ours.read_text().replace("corner_rounding: 0.7", "corner_rounding: 0.5"))
+    judge.cache_clear()  # another command is another process
+    told = run("align", *pairs)
+    assert told.status == 2 and "data.ranking.digest" in told.err, told.err
 
 
 @pytest.mark.parametrize(("ranking", "told"), [("realism", "missed"), ("displacement", "distance")])

@@ -968,6 +968,16 @@ def test_a_finished_evaluation_is_read_back(
     assert not list(runs.glob(".evaluation*"))
 
 
+def test_an_evaluation_of_fewer_figures_is_made_anew(
+    run: Callable, options: Callable, runs: Path, scored: dict, tmp_path: Path
+) -> None:
+    path, older = tmp_path / "evaluation.json", json.loads(json.dumps(scored))
+    del older["per_scene"]["close_pass"], older["mean"]["close_pass"]
+    path.write_text(json.dumps(older))
+    outcome = run("evaluate", *score_into(path, runs, options))
+    assert outcome.status == 0 and json.loads(path.read_text()) == scored, outcome.err
+
+
 def test_an_evaluation_goes_on_where_it_stopped(
     run: Callable, options: Callable, runs: Path, scored: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 from dpa.report.markup import Section, element, hint, joined
 from dpa.report.study import STUDIES, Study
 
-OF_ONE = ("experiment", "method", "rankings", "pictures")
+OF_ONE = ("experiment", "method", "only", "rankings", "pictures", "decoding.chosen")
 """Options that belong to one experiment alone."""
 OF_ALL = "experiment.checkpoints="
 """But not which checkpoints are kept: ``alignment.snapshots``, which experiments of a folder share, goes with it."""

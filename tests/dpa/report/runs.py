@@ -148,8 +148,10 @@ def row(folder: Path, method: str, seed: int, decoding: tuple[float, float], spl
     per_scene = values(method, seed, decoding)
     known = {figure: [value for value in scenes if value is not None] for figure, scenes in per_scene.items()}
     mean = {figure: math.fsum(scenes) / len(scenes) for figure, scenes in known.items()}
+    options = {"scenes": f"of {split}", "evaluation": {"num_rollouts": 32, "metric": ["2024", "0123"]}}
     write(
-        folder / file, {"options": {}, "mean": mean, "likelihood": {}, "scenes": ["s"] * SCENES, "per_scene": per_scene}
+        folder / file,
+        {"options": options, "mean": mean, "likelihood": {}, "scenes": ["s"] * SCENES, "per_scene": per_scene},
     )
     identity = {"method": method, "seed": seed, "top_p": decoding[0], "temperature": decoding[1], "file": file}
     return identity | {"n_scenes": SCENES, "pair_accuracy": 0.6, **mean}

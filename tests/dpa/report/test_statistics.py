@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from dpa.report.statistics import (
     SCENES,
     SEEDS_AND_SCENES,
-    compare_methods,
     paired_bootstrap,
     summary,
     unpaired_bootstrap,
@@ -152,42 +151,6 @@ def test_what_does_not_pair_is_refused(shape: tuple[int, int]) -> None:
 def test_a_row_of_scores_without_seeds_is_refused() -> None:
     with pytest.raises(ValueError, match=r"\[seeds, scenes\].*got shape \[5\]"):
         summary(np.zeros(5))
-
-
-def test_methods_are_paired_with_the_reference_run_of_the_same_seed() -> None:
-    scores = {
-        "reference": {"0": [0.0, 0.0], "1": [1.0, 1.0]},
-        "A": {"1": [1.5, 1.5], "0": [0.5, 0.5]},  # order of the seeds does not matter
-        "B": {"1": [0.9, 0.9]},
-    }
-    first, second = compare_methods(scores, "reference", num_resamples=50)
-    assert first == {
-        "method": "A",
-        "realism_difference": 0.5,
-        "ci95": [0.5, 0.5],
-        "over": SEEDS_AND_SCENES,
-        "n_seeds": 2,
-    }
-    assert second["realism_difference"] == pytest.approx(-0.1)
-    assert second["over"] == SCENES
-
-
-@pytest.mark.parametrize(
-    ("runs", "message"),
-    [
-        ({"7": [0.0, 0.0]}, r"A: seeds \['7'\] have no run of 'reference'"),
-        ({"0": [0.0]}, "A against reference: .*do not pair"),
-        ({"0": [0.0, 0.0], "1": [0.0]}, "A against reference: .*different numbers of scenes"),
-    ],
-)
-def test_a_method_that_cannot_be_compared_is_named(runs: dict[str, list[float]], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        compare_methods({"reference": {"0": [0.0, 0.0], "1": [0.0, 0.0]}, "A": runs}, "reference", num_resamples=10)
-
-
-def test_a_missing_reference_is_named() -> None:
-    with pytest.raises(ValueError, match="no method 'reference'"):
-        compare_methods({"A": {"0": [0.0]}}, "reference")
 
 
 if __name__ == "__main__":

@@ -522,7 +522,7 @@ def test_what_is_missing_is_named_with_its_command(copied: Path, tmp_path: Path)
     (copied / "experiments" / "steps.json").unlink()
     given = (
         "python -m recipes.compare scenes=made experiment=methods experiment.checkpoints=last '~methods.cpl' "
-        "'seeds=[0,1,2]' output=elsewhere"
+        "'only=[dpa_omf]' decoding.chosen=runs/first 'seeds=[0,1,2]' output=elsewhere"
     )
     scenes = {"source": "sumo", "train": "num_scenes=120,split=train", "tune": 16, "eval": "split=test", "limit": None}
     scenes |= {"select": {"max_agents": 24, "complete_in": ["lights"]}, "shard_size": 256}
