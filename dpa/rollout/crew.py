@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import copy
 import multiprocessing
-import pickle
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from multiprocessing import connection
+from multiprocessing.reduction import ForkingPickler
 from typing import Any, Literal, NamedTuple, Protocol
 
 import torch
@@ -247,7 +247,7 @@ def _attempt(act: Callable[..., Any], *given: Any) -> tuple[Any, Exception | Non
 def _as_sent(error: Exception) -> Exception:
     """An error whose constructor takes other arguments than it keeps cannot be read back."""
     try:
-        pickle.dumps(copy.copy(error))  # copied as it is read back
+        ForkingPickler.dumps(copy.copy(error))  # as a pipe sends it; it is read back as it is copied
     except Exception:
         return RuntimeError(f"{type(error).__name__}: {error}")
     return error

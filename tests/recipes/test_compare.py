@@ -225,7 +225,7 @@ def test_a_folder_is_taken_over_whole_once_and_not_trained_on(
         (["alignment.snapshots=[3]"], "step_3/policy.pt does not exist; finish the experiment there"),
         (
             ["alignment.watch_interval=3", "collection.ranking.threads=2", "alignment.lr=0.5"],
-            "here: 'alignment.lr': [^,]*$",
+            r"here: 'alignment.lr': 3e-05 there, 0.5 here\.$",
         ),
         (
             ["reference=zoo:motionlm-nano-sumo"],
