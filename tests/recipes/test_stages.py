@@ -35,6 +35,7 @@ from dpa.training.optim import accumulate_gradients, clip_and_step
 from envs import keys
 from envs.convert import convert
 from envs.scene import CURRENT_STEP
+from envs.seeding import derive_seed
 from envs.sources.synthetic import straight_road
 from envs.store import SceneStore
 from recipes import evaluate as evaluation
@@ -257,6 +258,17 @@ def pairs_of(runs: Path, options: Callable, expert: PreferenceStore | None = Non
     return make_candidates(
         section, store, Contexts(scenes, model.featurize, episode), model.tokenizer, seed=0, expert=expert
     )
+
+
+@pytest.mark.parametrize("rank_by", ["distance", "ade"])
+def test_the_nearest_rollouts_are_imitated(runs: Path, options: Callable, rank_by: str) -> None:
+    store = PreferenceStore(runs / "preferences")
+    for row, group in enumerate(pairs_of(runs, options, kind="best", num=2, rank_by=rank_by)):
+        stored = store.read([row], num_agents=group.preferred.shape[1])[0]
+        nearest = stored[rank_by].argsort(dim=-1, stable=True)[:2]
+        assert torch.equal(group.preferred, stored[keys.TOKENS][nearest])
+    by_distance, by_ade = (getattr(store, name).argsort(dim=-1, stable=True)[:, :2] for name in ("distance", "ade"))
+    assert not torch.equal(by_distance, by_ade), "so the two cannot be mistaken for each other"
 
 
 @pytest.mark.parametrize(
@@ -610,6 +622,17 @@ def test_watched_rollouts_in_other_tokens_are_refused(
 def watched(runs: Path, options: Callable, folder: Path, *more: str) -> list[str]:
     given = [f"policy={runs / 'reference/policy.pt'}", f"preferences={runs / 'preferences'}", f"output={folder}"]
     return options("align", *given, "method.data.num=2", "alignment.watch_interval=2", *more)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_pairs_of_a_step_are_drawn_by_its_number_and_the_seed(
+    run: Callable, options: Callable, runs: Path, tmp_path: Path, seed: int
+) -> None:
+    with mock.patch("recipes.alignment.step.parts_of", wraps=parts_of) as drawing:
+        outcome = run("align", *watched(runs, options, tmp_path / "omf", f"seed={seed}"))
+    assert outcome.status == 0, outcome.err
+    drawn = [call.args[2].initial_seed() for call in drawing.call_args_list]
+    assert drawn == [derive_seed(seed, "pairs", step) for step in range(4)]
 
 
 def test_scenes_that_no_loss_sees_are_looked_at_along_the_way(
@@ -966,6 +989,16 @@ def test_a_finished_evaluation_is_read_back(
     monkeypatch.setattr(evaluation, "score_scene", None)
     assert run("evaluate", *score_into(runs / "evaluation.json", runs, options)).status == 0
     assert not list(runs.glob(".evaluation*"))
+
+
+def test_rollouts_are_drawn_as_the_decoding_says(run: Callable, options: Callable, runs: Path, tmp_path: Path) -> None:
+    likeliest, path = "top_p=0.000001", tmp_path / "sharp.json"
+    assert run("evaluate", *score_into(path, runs, options), f"decoding.{likeliest}").status == 0
+    assert json.loads(path.read_text())["per_scene"]["spread"] == pytest.approx([0.0] * 3, abs=1e-4)
+    outcome = run("collect", *collect_into(tmp_path / "sharp", runs, options), f"collection.decoding.{likeliest}")
+    assert outcome.status == 0, outcome.err
+    tokens = PreferenceStore(tmp_path / "sharp")[:][keys.TOKENS]
+    assert (tokens == tokens[:, :1]).all()
 
 
 def test_an_evaluation_of_fewer_figures_is_made_anew(

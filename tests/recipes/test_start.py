@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from dpa.training.checkpoint import load_policy
+from dpa.training.distributed import Ranks
 from dpa.training.loggers import read_curve
+from envs import keys
+from recipes import pretrain as pretraining
 from recipes.common.models import digest_of, open_policy, policy_file
 
 
@@ -53,6 +58,24 @@ def test_with_noise_start_and_policy_are_measured_by_the_labels_that_are_learnt(
     (first, before), *others = read_curve(tmp_path, "tune/nll")
     assert first == 0 and all(value == pytest.approx(before, abs=1e-4) for _, value in others)
     assert abs(before - load_policy(origin)[2]["tune_nll"]) > 1e-3
+
+
+def test_noisy_tokens_are_read_and_the_way_back_is_learnt(
+    run: Callable, options: Callable, stores: Path, origin: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen, whole = [], pretraining.accumulate_gradients
+
+    def watching(loss: Any, parts: Iterable[tuple[TensorDict, float]], ranks: Ranks) -> Any:
+        parts = list(parts)
+        seen.append((loss.tensor_keys.labels, parts[0][0]))
+        return whole(loss, parts, ranks)
+
+    monkeypatch.setattr(pretraining, "accumulate_gradients", watching)
+    noisy = ("pretraining.noise=0.3", "pretraining.steps=2", "pretraining.warmup=1")
+    outcome = run("pretrain", *elsewhere(options, stores, origin, tmp_path, *noisy))
+    assert outcome.status == 0, outcome.err
+    labels, batch = seen[0]
+    assert labels == keys.LABELS and not torch.equal(batch[keys.TOKENS], batch[keys.LABELS])
 
 
 def test_a_start_with_other_tokens_or_another_size_is_refused(

@@ -8,8 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from dpa.losses import KahnemanTverskyLoss
+from dpa.losses import KahnemanTverskyLoss, Side, token_network
 from tests.dpa.losses.by_hand import SHARE, VALID, divergence, gain, log_likelihood, sigmoid
+from tests.dpa.losses.conftest import table
 
 
 @pytest.mark.parametrize("reduction", sorted(SHARE))
@@ -52,6 +53,15 @@ def test_each_rollout_is_compared_with_how_far_the_policy_has_moved_in_its_scene
         log_likelihood(now, p) > log_likelihood(now, u) for p in batch["preferred"][0] for u in batch["unpreferred"][0]
     ]
     assert out["pair_accuracy"].item() == pytest.approx(sum(likelier) / len(likelier)), "every two of both sides"
+
+
+def test_the_anchor_is_the_drift_of_both_sides() -> None:
+    def side(drift: float) -> Side:
+        one = torch.ones(1, 1, 1, 1)
+        return Side(0 * one, drift * one, one.bool(), 1.0, "sum")
+
+    found = KahnemanTverskyLoss(token_network(table())).compare(side(1.0), side(3.0), None)
+    assert found.logit.tolist() == [[-2.0, 2.0]]
 
 
 def test_the_anchor_has_no_gradient(network: tuple, make_batch: Callable, trained: Callable) -> None:

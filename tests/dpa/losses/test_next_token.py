@@ -13,6 +13,7 @@ from dpa.models import collate_contexts, make_context
 from dpa.models.motionlm import MotionLM, featurize
 from dpa.tokens import VerletTokenizer
 from envs.sources.synthetic import straight_road
+from tests.dpa.losses.conftest import pairs, table
 
 VALID = [(0, 0), (0, 1), (0, 2), (1, 0)]
 
@@ -106,6 +107,17 @@ def test_keys_can_be_set_to_nested_ones(network: tuple, logs: TensorDict) -> Non
     assert (alone(nested) == expected).all()
     with pytest.raises(ValueError, match="targets"):
         loss.set_keys(targets="tokens")
+
+
+def test_only_labels_that_are_to_be_learnt_count() -> None:
+    batch = pairs().select("context", "token_valid").set("tokens", pairs()["preferred"])
+    learnt = batch["token_valid"].clone()
+    learnt[..., 0, 1:] = False
+    loss = NextTokenLoss(token_network(table()))
+    loss.set_keys(learnt="learnt")
+    loss(batch.set("learnt", learnt))["loss_next_token"].backward()
+    gradient = loss.actor_network_params["module", "logits"].grad
+    assert (gradient[0, 1:] == 0).all() and (gradient[0, 0] != 0).any()
 
 
 def test_plain_tensors_can_be_given_instead_of_a_tensordict(network: tuple, logs: TensorDict) -> None:

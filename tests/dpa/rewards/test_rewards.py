@@ -22,7 +22,7 @@ from dpa.rollout.job import RolloutJob, RolloutWorker
 from dpa.rollout.plan import RolloutTask
 from dpa.tokens import TokenAction, VerletTokenizer
 from envs.episode import EpisodeOptions
-from envs.scene import Scene
+from envs.scene import CURRENT_STEP, Scene
 from envs.sources.synthetic import red_light, straight_road
 from envs.traffic import TrafficEnv
 
@@ -71,6 +71,15 @@ def test_what_follows_the_first_decision_is_the_whole_distance_and_it_only_falls
     assert to_go.shape == (3, 2, decisions)
     torch.testing.assert_close(to_go[..., 0], road.ranking.agent_distance)
     assert (to_go.diff(dim=-1) <= 1e-6).all() and (to_go[..., -1] >= 0).all()
+
+
+def test_what_happens_where_the_log_has_ended_is_not_paid_for() -> None:
+    scene = straight_road(2)
+    rollouts = log_trajectory(scene, 80)[None].repeat(2, 1, 1, 1)
+    scene.agents.valid[0, CURRENT_STEP + 41 :] = False
+    rollouts[1, 0, 50:, 1] += 40.0  # beside the road
+    assert not REWARDS["offroad"](outcome_of(scene, rollouts)).any()
+    assert REWARDS["offroad"](outcome_of(straight_road(2), rollouts))[1, 0] == -1
 
 
 def test_a_decision_answers_for_what_comes_after_it_alone() -> None:
