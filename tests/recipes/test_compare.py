@@ -68,6 +68,8 @@ def test_every_method_is_compared_with_the_reference(finished: Path) -> None:
         assert 0 < row["realism"] <= 1 and 0 <= row["pair_accuracy"] <= 1 and row["n_scenes"] == 3
     drift = {entry["method"]: entry["kl"] for entry in found["likelihood"]}
     assert drift.pop("reference") == pytest.approx(0, abs=1e-6) and all(kl > 1e-6 for kl in drift.values())
+    likely = {entry["method"]: entry["nll_demonstration"] for entry in found["likelihood"]}
+    assert len(set(likely.values())) == len(likely), "each policy's own likelihoods"
 
 
 def test_a_reader_finds_the_values_of_every_scene_behind_a_number(finished: Path) -> None:

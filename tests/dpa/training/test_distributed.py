@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-import socket
+import tempfile
 import time
 from collections.abc import Callable
 from datetime import timedelta
@@ -38,27 +38,24 @@ IDLE = [[[3, 1], [2]], [[0]]]
 
 def start_ranks(world_size: int, function: Callable[..., None], *arguments: object) -> None:
     """Run ``function(ranks, *arguments)`` in processes that can reach each other; none is left behind."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    context = multiprocessing.start_processes(
-        enter, (world_size, port, function, *arguments), nprocs=world_size, join=False, start_method="spawn"
-    )
-    deadline = time.monotonic() + SECONDS
-    try:
-        while not context.join(timeout=1):  # raises what a rank raised
-            assert time.monotonic() < deadline, "the ranks wait for each other"
-    finally:
-        for process in context.processes:
-            process.kill()
-            process.join()
+    with tempfile.TemporaryDirectory() as folder:
+        meet = f"file://{folder}/ranks"
+        context = multiprocessing.start_processes(
+            enter, (world_size, meet, function, *arguments), nprocs=world_size, join=False, start_method="spawn"
+        )
+        deadline = time.monotonic() + SECONDS
+        try:
+            while not context.join(timeout=1):  # raises what a rank raised
+                assert time.monotonic() < deadline, "the ranks wait for each other"
+        finally:
+            for process in context.processes:
+                process.kill()
+                process.join()
 
 
-def enter(rank: int, world_size: int, port: int, function: Callable[..., None], *arguments: object) -> None:
+def enter(rank: int, world_size: int, meet: str, function: Callable[..., None], *arguments: object) -> None:
     torch.set_num_threads(1)
-    distributed.init_process_group(
-        "gloo", f"tcp://127.0.0.1:{port}", timedelta(seconds=SECONDS), rank=rank, world_size=world_size
-    )
+    distributed.init_process_group("gloo", meet, timedelta(seconds=SECONDS), rank=rank, world_size=world_size)
     function(Ranks(rank, world_size, rank), *arguments)
     distributed.destroy_process_group()
 
