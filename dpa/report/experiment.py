@@ -185,9 +185,9 @@ class Experiment:
         return SAMPLED.get(kind, f"sampled alike at {kind}")
 
     def grid(self) -> list[Decoding]:
-        """Every decoding that was tried, on the tuning scenes or, of the reference, where results are told."""
-        reference = (row for row in self.at_common.rows if row["method"] == REFERENCE)
-        return sorted({decoding_of(row) for row in (*self.tuning, *reference)})
+        """Every decoding that was tried on the tuning scenes; where others chose, of the reference on those told of."""
+        reference = [row for row in self.at_common.rows if row["method"] == REFERENCE]
+        return sorted({decoding_of(row) for row in self.tuning or reference})
 
 
 def decoding_of(row: Mapping[str, Any]) -> Decoding:

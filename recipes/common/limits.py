@@ -157,9 +157,6 @@ def check_added(overrides: Iterable[str], cfg: DictConfig) -> None:
         ...
         ValueError: vocabulary has no option 'radious'; it takes radius.
     """
-    if twice := next((override for override in overrides if override.startswith("++")), None):
-        key = twice.lstrip("+").partition("=")[0]
-        raise ValueError(f"{twice}: say {key}=... of an option that is there, and +{key}=... of a new one.")
     added = {override.lstrip("+").partition("=")[0] for override in overrides if override.startswith("+")}
     for key in sorted(added):
         section, _, option = key.rpartition(".")

@@ -324,7 +324,6 @@ def test_scenes_of_equal_ids_and_other_content_are_other_scenes(tmp_path: Path, 
         ),
         ("pretrain", "scenes.eval=null", "scenes.eval must be a path or a list of paths, got None"),
         ("pretrain", "+scenes.min_agents=4", "scenes has no option 'min_agents'; it takes source, train"),
-        ("pretrain", "++seed=3", "++seed=3: say seed=... of an option that is there, and +seed=... of a new one"),
         ("align", "+method.data.margn=0.1", "method.data.margn says nothing to method.data.kind=pairs"),
     ],
 )
