@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 
 import hydra
@@ -106,8 +105,6 @@ def check_collection(options: DictConfig) -> tuple[Decoding, Workers]:
     """
     decoding = build(Decoding, options.decoding, "collection.decoding")
     workers = build(Workers, options.workers, "collection.workers")
-    if workers.backend == "ray" and find_spec("ray") is None:
-        raise ValueError("collection.workers.backend=ray needs the extra `ray`: pip install 'dpa-omf[ray]'.")
     if options.num_rollouts < 1:
         raise ValueError(f"collection.num_rollouts must be 1 or more, got {options.num_rollouts}.")
     return decoding, workers

@@ -34,7 +34,7 @@ from recipes.alignment.inputs import OBSERVING
 from recipes.common.cli import refused
 from recipes.common.provenance import provenance
 from recipes.compare import adopt_policies, made_by, measure, train_policies
-from recipes.experiment.jobs import evaluate_job, runs_of
+from recipes.experiment.jobs import evaluate_job, references_of, runs_of
 from recipes.experiment.logged import log_experiment
 from recipes.experiment.pool import Job
 from recipes.experiment.runs import Run, RunFolder
@@ -144,19 +144,13 @@ def merged_config(parts: Sequence[Part], output: Path, trained: Path | None) -> 
         OmegaConf.update(cfg, each, _first(_select(part.found.config, each) for part in parts), merge=False)
     cfg.experiment.axis = _axis([part.found.config["experiment"]["axis"] for part in parts])
     cfg.logger.backend, cfg.logger.mode = "csv", "offline"  # what a part logged to need not be on this machine
-    starts = _first(map(_references, parts))
+    starts = _first(references_of(part.found.config) for part in parts)
     cfg.seeds = sorted(starts)
     cfg.reference = None if None in starts.values() else [starts[seed] for seed in cfg.seeds]
     if "only" in cfg:  # which archives of earlier versions do not have
         cfg.only = None
     cfg.output, cfg.trained = str(output), None if trained is None else str(trained)
     return cfg
-
-
-def _references(part: Part) -> dict[int, str | None]:
-    """What each seed starts from; None where it trains that itself."""
-    given, seeds = part.found.config["reference"], part.found.seeds
-    return dict(zip(seeds, given, strict=True)) if isinstance(given, list) else dict.fromkeys(seeds, given)
 
 
 def chosen_first(parts: Sequence[Part]) -> Chosen:

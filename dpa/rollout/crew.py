@@ -6,6 +6,7 @@ import copy
 import multiprocessing
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from multiprocessing import connection
 from multiprocessing.reduction import ForkingPickler
 from typing import Any, Literal, NamedTuple, Protocol
@@ -18,6 +19,9 @@ from dpa.rollout.job import RolloutJob, RolloutWorker
 from dpa.rollout.plan import RolloutTask
 from envs.allocator import keep_freed_memory
 from envs.workers import end_with_parent
+
+GRACE = 5.0
+"""Seconds in which a worker whose pipe is closed may end by itself."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +37,7 @@ class Workers:
 
     Raises:
         ValueError: no worker, several in one process, or an unknown backend.
+        ImportError: Ray is not installed.
 
     Examples:
         >>> Workers(2, "process")
@@ -53,6 +58,8 @@ class Workers:
             )
         if self.backend == "local" and self.count > 1:
             raise ValueError(f"{self.count} workers need backend=process or backend=ray, got backend=local.")
+        if self.backend == "ray" and find_spec("ray") is None:
+            raise ImportError("workers on Ray need the extra `ray`: pip install 'dpa-omf[ray]'.")
 
 
 class Outcome(NamedTuple):
@@ -199,10 +206,6 @@ class ProcessCrew:
         pipe.close()
         process.kill()
         process.join()
-
-
-GRACE = 5.0
-"""Seconds in which a worker whose pipe is closed may end by itself."""
 
 
 class _Hand(NamedTuple):

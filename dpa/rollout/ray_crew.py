@@ -32,7 +32,9 @@ class RayCrew:
     """
 
     def __init__(self, job: RolloutJob, workers: Workers) -> None:
-        self._ray = _ray()
+        import ray  # an extra, which Workers has looked for
+
+        self._ray = ray
         if not self._ray.is_initialized():
             self._ray.init(address=workers.address, include_dashboard=False, log_to_driver=False, logging_level="error")
         self.size = workers.count
@@ -105,14 +107,6 @@ class RayCrew:
 
     def _tell(self, hand: Any) -> Any:
         return hand.update.remote(*self._latest)
-
-
-def _ray() -> Any:
-    try:
-        import ray
-    except ImportError as error:
-        raise ImportError("workers on Ray need the extra `ray`: pip install 'dpa-omf[ray]'.") from error
-    return ray
 
 
 class _Hand:

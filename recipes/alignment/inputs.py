@@ -100,10 +100,12 @@ class Inputs:
             seed: of batches.
         """
         kind, data = method.data.kind, plain(method.data)
-        says_nothing = (*("pairs_per_scene",) * (kind in ON_POLICY), *("staleness",) * (kind not in ROLLED))
-        if kind in ROLLED:  # of a metric in a file its content; rewards that weigh nothing and threads change nothing
+        read = {"pairs_per_scene": kind not in ON_POLICY, "staleness": kind in ROLLED}
+        says_nothing = [name for name, of_use in read.items() if not of_use]
+        if kind in ROLLED:  # of a metric in a file its content counts, and not how many threads rank
             data["ranking"] = build_distance(method.data.ranking, "method.data.ranking").describe()
-            data |= {"rewards": rewards_of(method.data)} if "rewards" in data else {}
+        if "rewards" in data:
+            data["rewards"] = rewards_of(method.data)
         return {
             "data": data,
             "loss": plain(method.loss),

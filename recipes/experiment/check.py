@@ -33,8 +33,8 @@ from recipes.experiment.jobs import (
     check_made_alike,
     chosen_by,
     compared_policy,
-    named_reference,
     reference_of,
+    references_of,
     trained_in,
 )
 from recipes.experiment.methods import checkpoints_of, policies_of, read_setups
@@ -64,6 +64,7 @@ def check_experiment(cfg: DictConfig) -> None:
     RealismConfig.load(str(cfg.evaluation.metric))
     if not cfg.seeds or len(set(cfg.seeds)) < len(cfg.seeds):
         raise ValueError(f"seeds must be one or more, each once, got {list(cfg.seeds)}.")
+    _check_number(cfg)
     if cfg.trained is None:
         _check_references(cfg)
     else:
@@ -95,7 +96,6 @@ def _check_references(cfg: DictConfig) -> None:
     each = cfg.reference if OmegaConf.is_list(cfg.reference) else [cfg.reference]
     if cfg.reference is not None and not all(isinstance(name, str) for name in each):
         raise ValueError(f"reference must be a file or zoo:NAME, a list of them, or null, got {cfg.reference!r}.")
-    _check_number(cfg)
     if cfg.reference is not None:
         for seed in cfg.seeds:
             reference_of(cfg, seed)
@@ -121,12 +121,12 @@ def _check_trained(cfg: DictConfig) -> None:
     theirs, mine = read_experiment(runs.experiment(name)).config, plain(cfg)
     if origin := theirs.get("trained"):
         raise ValueError(f"trained={cfg.trained} has its policies from {origin}; say trained={origin}.")
-    _check_number(cfg)
-    for seed in set(cfg.seeds) & set(theirs["seeds"]):
-        if (named := named_reference(cfg, seed)) != (other := named_reference(OmegaConf.create(theirs), seed)):
+    aligned = references_of(theirs)
+    for seed, named in references_of(cfg).items():
+        if seed in aligned and named != aligned[seed]:
             raise ValueError(
-                f"trained={cfg.trained} has aligned reference={other} of seed {seed}, and here it is {named}; give the "
-                "same seeds and references here."
+                f"trained={cfg.trained} has aligned reference={aligned[seed]} of seed {seed}, and here it is {named}; "
+                "give the same seeds and references here."
             )
     if differ := differences(_of_training(theirs, mine["methods"]), _of_training(mine, mine["methods"])):
         raise ValueError(f"trained={cfg.trained} was trained with other options than are told here: {differ}.")

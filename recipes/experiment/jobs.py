@@ -6,6 +6,7 @@ clock, which does not see what a killed process had done.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -57,12 +58,14 @@ def compared_policy(cfg: DictConfig) -> dict[str, Any]:
         return open_policy(trained_in(cfg).policy(cfg.seeds[0], REFERENCE))[2]
     if cfg.reference is None:
         raise ValueError("there is no section model to train references of; say model=NAME, or reference=FILE.")
-    return open_policy(named_reference(cfg, cfg.seeds[0]))[2]
+    return open_policy(references_of(cfg)[cfg.seeds[0]])[2]
 
 
-def named_reference(cfg: DictConfig, seed: int) -> str | None:
-    """The reference that the options name for a seed; None where they name none."""
-    return cfg.reference[list(cfg.seeds).index(seed)] if OmegaConf.is_list(cfg.reference) else cfg.reference
+def references_of(config: Mapping[str, Any]) -> dict[int, str | None]:
+    """What each seed of an experiment starts from; None where it trains that itself."""
+    given, seeds = config["reference"], config["seeds"]
+    one = given is None or isinstance(given, str)
+    return dict.fromkeys(seeds, given) if one else dict(zip(seeds, given, strict=True))
 
 
 def reference_of(cfg: DictConfig, seed: int) -> Path:
@@ -71,7 +74,7 @@ def reference_of(cfg: DictConfig, seed: int) -> Path:
     Raises:
         ValueError: the zoo has none of this name, or its options are not those of ``model`` or of the first reference.
     """
-    named = named_reference(cfg, seed)
+    named = references_of(cfg)[seed]
     path = policy_file(named)
     check_made_alike(cfg, path, f"reference={named}")
     return path

@@ -13,6 +13,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from dpa.models import Decoding
+from dpa.report.statistics import SEEDS_AND_SCENES
 from envs.files import write_json
 from envs.locks import alone_in
 from recipes.common.cli import CONFIG
@@ -453,6 +454,18 @@ def test_scenes_without_realism_end_a_comparison_with_the_option_that_names_them
     path.write_text(json.dumps({"per_scene": {"realism": [None, None]}}))
     with pytest.raises(ValueError, match=r"no scene of scenes\.eval has realism under every policy.*name other scenes"):
         Results(cfg, [("reference", run)])
+
+
+def test_methods_are_paired_with_the_reference_of_the_same_seed(tmp_path: Path) -> None:
+    cfg = configuration("seeds=[0,1]", f"output={tmp_path}")
+    scores = {"reference": {0: [0.0, 0.0], 1: [1.0, 1.0]}, "dpa_omf": {0: [0.5, 0.5], 1: [1.5, 1.5]}}
+    runs = {method: Run(method, Decoding(0.95, 1.0)) for method in scores}
+    for method, by_seed in scores.items():
+        for seed, realism in by_seed.items():
+            write_json(runs_of(cfg).evaluation(seed, runs[method], "eval"), {"per_scene": {"realism": realism}})
+    (entry,) = Results(cfg, list(runs.items())).paired([("dpa_omf", runs["dpa_omf"])], ("reference", runs["reference"]))
+    told = {"realism_difference": 0.5, "ci95": [0.5, 0.5], "over": SEEDS_AND_SCENES, "n_seeds": 2}
+    assert entry.items() >= (told | {"method": "dpa_omf", "against": "reference", "against_top_p": 0.95}).items()
 
 
 # --- the account ----------------------------------------------------------------------------------------------------
